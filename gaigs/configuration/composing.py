@@ -54,11 +54,16 @@ def compose(*overrides: str, **options) -> dict:
 
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
-    """``compose`` for which a name in ``options`` is searched only in the given ``sections``."""
+    """The configuration of a run, as from ``compose``.
+
+    Args:
+        overrides, options: As for ``compose``.
+        sections: Keys of the parts in which the names of options are searched; empty for all parts.
+    """
     choices, values = _choices(options)
     with _composing:
         running = GlobalHydra.instance()
-        before = running.hydra
+        before = running.hydra  # the command line's own instance, restored at the end
         paths = [] if before is None else running.config_loader().get_search_path().get_path()
         try:
             with contextlib.ExitStack() as stack:

@@ -33,7 +33,7 @@ class PluginConfigurations(SearchPathPlugin):
 
 
 def _keep(part: Any, memo: dict) -> Any:
-    """The deep copy of a part that stays as it is: Hydra copies it for each of 210 groups."""
+    """The same object in place of a deep copy, since Hydra copies it for each of 210 groups."""
     return part
 
 

@@ -103,6 +103,7 @@ def option_keys(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iter
     """
     for part in parts:
         value = config[part]
+        # Below the top level only a mapping with a name is a part; others are values of options.
         if isinstance(value, Mapping) and (not prefix or "name" in value):
             yield from option_keys(value, value.keys(), f"{prefix}{part}.")
         elif prefix and not str(value).startswith("${"):

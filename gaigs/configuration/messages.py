@@ -87,7 +87,10 @@ def is_multirun() -> bool:
 
 
 def nearest(word: str, config: Mapping) -> str:
-    """Full keys of the options with the most similar name, joined by "or"; may be empty."""
+    """Full keys of the options with the name most similar to a word, joined by "or".
+
+    The text is empty if no name is similar.
+    """
     parts = config.keys() - {"hydra", "survey", "place", "locate", "export", "view"}
     names = {key: key.rpartition(".")[2] for key in (*parts, *option_keys(config, parts))}
     near = similar(word, {*names.values()} - {"name"})

@@ -168,7 +168,8 @@ class Links:
             ValueError: All training transmitters are at one point.
         """
         training = self.query[self.split.train]
-        # A place has a link to each receiver. Keys find one of these ten times faster than unique.
+        # A place may have several links. Integer keys drop most of them ten times faster than a
+        # comparison of coordinates.
         _, first = np.unique(training.place_keys, return_index=True)
         train = training.transmitters[first].unique(dim=0)
         if len(train) < 2:
@@ -243,11 +244,11 @@ def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: boo
 
 
 def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
-    """Links after all preparations that follow from a split: front ends, places, constant parts.
+    """Links with a split, and with all preparations that follow from it.
 
-    Constant subcarriers of channels are removed. In links with ``uncertainties`` receivers without
-    a training link are removed, and unknown places of receivers are estimated from the training
-    links. The remarks state each change.
+    Responses of front ends are learnt for channels, and constant subcarriers are removed. In links
+    with ``uncertainties`` receivers without a training link are removed, and unknown places of
+    receivers are estimated from the training links. The remarks state each change.
 
     Args:
         split: Configuration of the split.
@@ -257,14 +258,14 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
         links = without_constant(links)
-    parts = registry("split").build(split, links=links)
-    _check_split(parts, len(links))
+    division: Split = registry("split").build(split, links=links)
+    _check_split(division, len(links))
     if links.held_out is not None:
         for verb, task in (("trained", links.task), ("tested", links.held_out.task)):
             band = task.frequencies / 1e9
-            name = f"{parts.name}, {verb} at {band.min():.7g} .. {band.max():.7g} GHz"
-            parts = replace(parts, name=name)
-    links = replace(links, split=parts)
+            name = f"{division.name}, {verb} at {band.min():.7g} .. {band.max():.7g} GHz"
+            division = replace(division, name=name)
+    links = replace(links, split=division)
     if links.frame is None:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if links.uncertainties is not None and not links.one_radio:
@@ -319,9 +320,10 @@ def check_elements(links: Links) -> None:
         )
     everyone = torch.arange(len(sizes))
     absent = lacking(links.receivers, everyone, count, links.task.frequencies)  # (r, e, s)
-    for part in torch.arange(len(links) if absent.any() else 0).split(1024):
+    checked = len(links) if absent.any() else 0
+    for part in torch.arange(checked).split(1024):  # as many as fit into memory
         receivers = links.query.receivers[part]
-        beyond = (links.labels[part] != 0) & absent[receivers.long()]
+        beyond = (links.labels[part] != 0) & absent[receivers.long()]  # (1024, e, s)
         if beyond.any():
             link, element, subcarrier = beyond.nonzero()[0].tolist()
             receiver = int(receivers[link])
@@ -369,7 +371,7 @@ def without_constant(links: Links) -> Links:
 
 
 def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
-    """The links where ``kept`` is true, renumbered, before a split; all receivers stay."""
+    """The links where ``kept`` is true, renumbered; for links without a split. Receivers stay."""
     number = kept.cumsum(0) - 1  # new number of each kept link
     read_parts: Any = links.official
 

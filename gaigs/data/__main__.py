@@ -106,7 +106,7 @@ def _write_paths(folder: Path, links: Links, order: int) -> None:
         paths = trace(synthetic.ROOM, users, position, frequency, order)
         lengths = (paths.images - position).norm(dim=-1)  # (users, paths)
         waves = free_space(lengths, torch.tensor(frequency))
-        points = bounces(synthetic.ROOM, paths.images, position, order)
+        points = bounces(synthetic.ROOM, paths.images, position, order)  # from the receiver on
         fields = (paths.gains * waves).numpy()
         stations.append(deepmimo.Station(position.numpy(), fields, points.numpy()))
     deepmimo.write_scenario(folder, frequency, users.numpy(), stations)

@@ -3,7 +3,6 @@
 import inspect
 import logging
 import math
-import reprlib
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -21,6 +20,7 @@ from gaigs.core.task import Task, check_range
 from gaigs.data import Links, divide
 from gaigs.data.parts import check_parts
 from gaigs.data.readings import are_one_radio, marks_of, remark_on_zeros
+from gaigs.data.rows import are_numbers, parts_of_rows
 from gaigs.io.frames import is_frame, read_frame
 from gaigs.io.tables import number_places, shortened
 from gaigs.registry import check_instance, registry, suggest
@@ -103,13 +103,12 @@ def from_arrays(
     check_range(task, labels, "labels")
     if task.is_scalar and task.unit == "dBm":
         _doubt_levels(labels, received, remarks)
-    row = rows[received]
-    sites = number_places(places.tolist())[1]
+    row = rows[received]  # row of ``transmitters`` of each received link
+    sites = number_places(places.tolist())[1]  # number of each row's place
     parts: Any = None
     if test_rows is not None:
-        parts = _parts(row, len(places), test_rows, train_rows)
-        shared = int(torch.isin(sites[row[parts[1]]], sites[row[parts[0]]]).sum())
-        remarks += [f"{shared} test links stand at places of training links"] * (shared > 0)
+        parts = parts_of_rows(row, len(places), test_rows, train_rows)
+        remarks += _remarks_on_shared_places(*(sites[row[part]] for part in parts))
     undivided = Links(
         query=Query(places[row], index[received].long(), _carriers(frequency, task, row, places)),
         receivers=receivers,
@@ -126,6 +125,12 @@ def from_arrays(
     links = divide(undivided, config)
     _warn_of_untrained(receivers, links.receivers)
     return links
+
+
+def _remarks_on_shared_places(train: Int[Tensor, " k"], test: Int[Tensor, " l"]) -> list[str]:
+    """A remark if test links stand at places of training links; both as numbers of places."""
+    shared = int(torch.isin(test, train).sum())
+    return [f"{shared} test links stand at places of training links"] if shared else []
 
 
 def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver]) -> None:
@@ -192,7 +197,7 @@ def split_configuration(
 
 
 class _Ends(NamedTuple):
-    """Receivers, and the receiver of each link."""
+    """Receiving ends of the links: the receivers, and the receiver of each link."""
 
     receivers: tuple[Receiver, ...]
     index: Any  # receiver of each link; None if the labels' shape tells
@@ -212,7 +217,8 @@ class _Ends(NamedTuple):
         if given is not None or not self.is_one_each:
             return bool(given)
         is_one = are_one_radio(len(self.receivers), len(sent), len(sent.unique()))
-        remarks += ["the receivers are places of one radio; one_radio=False parts them"] * is_one
+        if is_one:
+            remarks.append("the receivers are places of one radio; one_radio=False parts them")
         return is_one
 
 
@@ -226,7 +232,11 @@ def _find_ends(
     height: float,
     remarks: list[str],
 ) -> _Ends:
-    """The given receivers, or receivers made from positions or the shape of labels."""
+    """The given receivers, or receivers made from positions or the shape of labels.
+
+    Arguments are as for ``from_arrays``. ``names`` has the names of the labels' columns, if any,
+    ``places`` has the transmitters [m], and remarks are added to ``remarks``.
+    """
     receivers = (receivers,) if isinstance(receivers, Receiver) else receivers
     is_list = isinstance(receivers, Sequence)
     if is_list and all(isinstance(receiver, Receiver) for receiver in receivers):
@@ -273,10 +283,12 @@ def _find_stands(
     elif receivers is None:
         numbers = as_tensor("index", 0 if index is None else index, "numbers of receivers")
         count = int(np.nanmax(numbers.numpy(), initial=0)) + 1
-        count = shape[1] if index is None and len(shape) > 1 else count
+        if index is None and len(shape) > 1:  # labels (n, k, ...)
+            count = shape[1]
         receivers = [None] * count
     if isinstance(receivers, Sequence) and any(position is None for position in receivers):
         given = [position for position in receivers if position is not None]
+        # NaN of the same length, so that all positions make one array.
         nowhere = [math.nan] * (len(given[0]) if given else 3)
         receivers = [nowhere if position is None else position for position in receivers]
     positions = as_numbers("receivers", _with_height(receivers, height), "positions [m]")
@@ -292,7 +304,11 @@ def _find_stands(
 
 
 def _with_height(positions: Any, height: float, remarks: list[str] | None = None) -> Any:
-    """Positions (n, 2) with a height [m]; all others as they are."""
+    """Positions (n, 2) with a height [m]; values of another shape are unchanged.
+
+    Args:
+        remarks: List to which a remark on the height is added; None for no remark.
+    """
     try:
         shape = np.shape(positions)
     except ValueError:  # lists of different lengths, which have an error of their own
@@ -315,8 +331,15 @@ def _make_receivers(
 ) -> _Ends:
     """Receivers at positions, named rx0, rx1, ... without names, and the receiver of each link.
 
-    With ``is_one_a_place`` (one label for each place) and as many positions as places, position i
-    is the receiver of link i; equal positions are one receiver.
+    If labels and positions are one for each transmitter place, position i is the receiver of link
+    i, and equal positions are one receiver.
+
+    Args:
+        stands: Names and positions of the receivers.
+        index: Receiver of each link as given by the user.
+        places: Positions of the transmitters [m].
+        is_one_a_place: True if there is one label for each place, and no ``index``.
+        remarks: List to which remarks are added.
     """
     positions = stands.positions
     uncertainties = torch.where(stands.is_known, 0.0, math.inf)
@@ -375,8 +398,14 @@ class _LinkArrays(NamedTuple):
 def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Task) -> _LinkArrays:
     """Row, receiver and label of each link.
 
-    Labels are (n, ...) with an index, or (n, k, ...) for n = ``count`` rows and k = ``receivers``;
-    other shapes are a ``ValueError``.
+    Args:
+        labels: Labels (n, ...) with an index, or (n, k, ...) without.
+        index: Number of each link's receiver, or one number for all; None without an index.
+        count: Number n of rows.
+        receivers: Number k of receivers.
+
+    Raises:
+        ValueError: Labels have another shape, or an index is no receiver's number.
     """
     shape = tuple(task.shape)
     rows = torch.arange(count)
@@ -393,7 +422,7 @@ def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Ta
             f"link in index, or {(count, receivers, *shape)}, one for each transmitter and "
             f"receiver, got {tuple(labels.shape)}"
         )
-    if index.shape != (len(rows),) or not _are_numbers(index, receivers):
+    if index.shape != (len(rows),) or not are_numbers(index, receivers):
         raise ValueError(
             f"index must be {count} whole numbers from 0 to {receivers - 1}, got "
             f"{index.tolist()[:5]} ..."
@@ -407,11 +436,11 @@ def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " 
     Raises:
         ValueError: No link was received, or a label is NaN or infinite in part.
     """
-    flat = labels.reshape(len(labels), -1)
-    received = ~flat.isnan().all(1)
+    values = labels.reshape(len(labels), -1)  # (m, values of a label)
+    received = ~values.isnan().all(1)
     if task.dtype.is_complex:
-        received &= (flat != 0).any(1)
-    broken = received & ~flat.isfinite().all(1)
+        received &= (values != 0).any(1)
+    broken = received & ~values.isfinite().all(1)
     if not received.any() or broken.any():
         where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
         raise ValueError(
@@ -424,7 +453,7 @@ def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " 
 
 
 def _doubt_levels(labels: Tensor, received: Tensor, remarks: list[str]) -> None:
-    """Remarks, with a warning, about levels that may mean "not heard"."""
+    """Adds a remark, and logs a warning, about levels that may mean "not heard"."""
     doubts = [remark_on_zeros(labels[received].tolist()).removeprefix("; ")]
     for mark in marks_of(labels[:, None].numpy()):
         readings = int((labels == mark).sum())
@@ -438,7 +467,10 @@ def _doubt_levels(labels: Tensor, received: Tensor, remarks: list[str]) -> None:
 def _carriers(
     frequency: Any, task: Task, row: Int[Tensor, " m"], places: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " m"] | None:
-    """Carrier of each link [Hz]; for channels by default the middle of the subcarriers."""
+    """Carrier of each link [Hz]; for channels by default the middle of the subcarriers.
+
+    The result is None if the carrier is unknown. ``row`` has the row of each link in ``places``.
+    """
     if frequency is None and task.frequencies is not None:
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
     if frequency is None:
@@ -453,48 +485,3 @@ def _carriers(
     carriers = carriers.expand(count)[row]
     check_carrier("frequency", carriers.unique())
     return carriers
-
-
-def _parts(
-    row: Int[Tensor, " m"], count: int, test_rows: Any, train_rows: Any
-) -> tuple[Int[Tensor, " k"], Int[Tensor, " l"]]:
-    """Training and test links, by the rows of ``transmitters`` that were given."""
-    testing = _rows("test_rows", test_rows, count)
-    everything = torch.arange(count)
-    training = everything[~torch.isin(everything, testing)]
-    if train_rows is not None:
-        training = _rows("train_rows", train_rows, count)
-    both = training[torch.isin(training, testing)]
-    if len(both):
-        raise ValueError(
-            f"train_rows and test_rows must have no row in common, got {both[0].item()} in both"
-        )
-    if not len(training):
-        raise ValueError(f"test_rows leave no row to train on, got all {count}")
-    return torch.isin(row, training).nonzero()[:, 0], torch.isin(row, testing).nonzero()[:, 0]
-
-
-def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
-    """Ascending numbers of rows, from numbers or from a mask of all ``count`` rows."""
-    rows = as_tensor(name, values, "numbers of rows")
-    if rows.dtype == torch.bool and rows.shape == (count,):
-        rows = rows.nonzero()[:, 0]
-    given = reprlib.repr(values)
-    if rows.ndim != 1 or not len(rows) or not _are_numbers(rows, count):
-        raise ValueError(
-            f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got "
-            f"{given}"
-        )
-    numbers = rows.long()
-    if len(numbers.unique()) < len(numbers):
-        raise ValueError(
-            f"{name} must hold each row once, got {given}; a mask must be boolean, of True and "
-            "False"
-        )
-    return numbers.sort().values
-
-
-def _are_numbers(values: Tensor, count: int) -> bool:
-    """True for whole numbers from 0 to ``count`` - 1."""
-    is_whole = not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
-    return is_whole and bool(((values >= 0) & (values < count)).all())

@@ -45,6 +45,7 @@ def hold_out_band(
             f"data.band_train={[*band_train]} leaves no subcarrier to test on; "
             "choose a narrower band"
         )
+    # A link needs a signal to train on and a signal to test on.
     has_both = _has_signal(links, chosen) & _has_signal(links, others)  # (n,)
     if silent := int((~has_both).sum()):
         remark = f"{silent} that are zero in a band are left out"
@@ -84,12 +85,16 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     phases = {part.task.phase for part in parts}
     if len(phases) > 1:
         raise ValueError(f"all bands must have one data.phase, got {sorted(phases)}")
-    # Half-way on a logarithmic scale, so that each frequency is in a band.
-    limits = [0.0, *(frequencies[ends] * frequencies[ends + 1]).sqrt().tolist(), math.inf]
-    pieces = []
+    # Limits half-way on a logarithmic scale, so that each frequency is in a band.
+    inner = (frequencies[ends] * frequencies[ends + 1]).sqrt()
+    limits = [0.0, *inner.tolist(), math.inf]
+    pieces = []  # the links of one receiver in one band each
     for part, band in itertools.product(parts, itertools.pairwise(limits)):
         pieces += list(_pieces(part, band, frequencies))
     elements = max(piece.labels.shape[1] for piece in pieces)
+    padded = []  # smaller arrays get elements with channels of 0
+    for piece in pieces:
+        padded.append(pad(piece.labels, (0, 0, 0, elements - piece.labels.shape[1])))
     names = _name([piece.receivers[0] for piece in pieces], frequencies if len(ends) else None)
     receivers: dict[str, Receiver] = {}
     for piece, name in zip(pieces, names, strict=True):
@@ -110,9 +115,7 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
             torch.full((len(transmitters),), carrier),
         ),
         receivers=tuple(receivers.values()),
-        labels=torch.cat(
-            [pad(piece.labels, (0, 0, 0, elements - piece.labels.shape[1])) for piece in pieces]
-        ),
+        labels=torch.cat(padded),
         task=Csi(elements, frequencies, phases.pop()),
         rows=number_places(transmitters.tolist())[1],
         remarks="; ".join(filter(None, remarks)),
@@ -122,7 +125,14 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
 def _pieces(
     part: Links, band: tuple[float, float], frequencies: Float[Tensor, " s"]
 ) -> Iterator[Links]:
-    """The links of each receiver of a part within a band, with labels at all subcarriers."""
+    """The links of each receiver of a part in one band, with labels at all subcarriers.
+
+    Labels are 0 outside the band. Receivers without a signal in the band are left out.
+
+    Args:
+        band: Lower and upper limit [Hz].
+        frequencies: Subcarriers of all parts [Hz].
+    """
     for number, antenna in enumerate(part.receivers):
         receiver = replace(antenna, band=band)
         in_part = receiver.hears(part.task.frequencies)
@@ -130,7 +140,7 @@ def _pieces(
         links = kept_links(part, is_received & (part.query.receivers == number))
         if not len(links):
             continue
-        given = part.task.frequencies[in_part].sort()
+        given = part.task.frequencies[in_part].sort()  # ascending, as ``frequencies``
         in_all = receiver.hears(frequencies)
         if not torch.equal(given.values, frequencies[in_all]):
             raise ValueError(
@@ -138,7 +148,6 @@ def _pieces(
                 f"{int(in_all.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
                 "leave the others out"
             )
-        # Channels are 0 outside the receiver's band.
         labels = links.labels.new_zeros(*links.labels.shape[:2], len(frequencies))
         labels[..., in_all] = links.labels[..., in_part][..., given.indices]
         yield replace(links, receivers=(receiver,), labels=labels)

@@ -11,12 +11,15 @@ from gaigs.data import Links
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Raises a ``ValueError`` unless links have a split, and a scene's receivers and labels."""
+    """Raises a ``ValueError`` unless links have a split, and receivers and labels of a scene.
+
+    The scene is that of the model; None for a model that is not trained yet.
+    """
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:
         return
-    # The normalisation is the labels' scale in words.
+    # The normalisation only describes the scale of the labels, and may differ.
     axes = [task.state() | {"normalisation": ""} for task in (scene.task, links.task)]
     if not are_alike(*axes):
         expected, got = (f"{task.name!r} {tuple(task.shape)}" for task in (scene.task, links.task))
@@ -43,7 +46,7 @@ def _antennas(receivers: tuple[Receiver, ...]) -> list[tuple]:
 
 
 def are_alike(a: Any, b: Any) -> bool:
-    """True if nested values are equal, tensors to 1e-5."""
+    """True if nested values are equal; numbers of tensors may differ by about 1e-5."""
     if isinstance(a, Tensor):
         is_same = isinstance(b, Tensor) and a.shape == b.shape
         return is_same and torch.allclose(a.double(), b.double(), rtol=1e-6, atol=1e-5)

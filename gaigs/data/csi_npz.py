@@ -110,8 +110,8 @@ def read(
         ImportError: The file needs h5py.
         ValueError: The file has a defect; the message names array, row and value.
     """
-    several = not isinstance(file, str | Path)
-    files = [find_file(path, "a file of channels") for path in (file if several else [file])]
+    paths = [file] if isinstance(file, str | Path) else file
+    files = [find_file(path, "a file of channels") for path in paths]
     arrays = arrays or {}
     known = ARRAYS | RESPONSES
     if unknown := [suggest(name, known) for name in arrays if name not in known]:
@@ -121,7 +121,8 @@ def read(
             "data.parts must be first or last, the axis of real and imaginary part, or null, "
             f"got {parts!r}"
         )
-    if len(files) != 1 and not (files and band_train is None and band_test is None):
+    holds_out = band_train is not None or band_test is not None
+    if not files or (len(files) > 1 and holds_out):
         raise ValueError(
             f"data.file must be one file where data.band_train is given, else one or more, got "
             f"{len(files)}"
@@ -129,7 +130,7 @@ def read(
     links = [to_links(path, *_load(path, arrays, parts), phase) for path in files]
     if one_radio is not None:
         links = [replace(part, one_radio=one_radio) for part in links]
-    if band_train is None and band_test is None:
+    if not holds_out:
         return _with_remark(in_bands(links, band_gap), one_radio)
     return _with_remark(hold_out_band(links[0], band_train, band_test), one_radio)
 
@@ -188,7 +189,7 @@ def _to_links(
     carrier = (frequencies.min() + frequencies.max()).item() / 2
     count = numbers["h"].shape[1]
     elements = numbers.get("elements", torch.zeros(count, 3))
-    everyone = _to_receivers(numbers["rx"].float(), elements.float())
+    candidates = _to_receivers(numbers["rx"].float(), elements.float())  # also without links
 
     remarks = [
         f"{len(rows)} channels from {len(places)} places at {len(present)} receivers",
@@ -196,7 +197,7 @@ def _to_links(
     ]
     if silent := int((~has_signal).sum()):
         remarks.append(f"{silent} that are zero throughout are left out")
-    if absent := [receiver.name for k, receiver in enumerate(everyone) if k not in present]:
+    if absent := [receiver.name for k, receiver in enumerate(candidates) if k not in present]:
         remarks.append(f"receivers without links are left out: {', '.join(absent)}")
     if count > 1 and "elements" not in arrays:
         remarks.append(
@@ -208,7 +209,7 @@ def _to_links(
     one_radio = are_one_radio(len(present), len(rows), len(places))
     return Links(
         query=Query(transmitters, receivers, torch.full((len(rows),), carrier)),
-        receivers=tuple(everyone[k] for k in present.tolist()),
+        receivers=tuple(candidates[k] for k in present.tolist()),
         one_radio=one_radio,
         labels=numbers["h"][has_signal],
         task=Csi(count, frequencies, phase),
@@ -221,7 +222,7 @@ def _to_receivers(positions: Tensor, elements: Tensor) -> list[Receiver]:
     """Receivers at positions (k, 3), with the same elements (e, 3) or their own (k, e, 3) [m]."""
     receivers = []
     for k, offsets in enumerate(elements.expand(len(positions), -1, -1)):
-        array = Array(offsets[offsets.isfinite().all(1)])
+        array = Array(offsets[offsets.isfinite().all(1)])  # elements of NaN are missing
         receivers.append(Receiver(f"rx{k}", Pose(positions[k], torch.eye(3)), array))
     return receivers
 
@@ -247,7 +248,9 @@ def write(folder: str | Path, links: Links) -> None:
 def _load(
     file: Path, given: Mapping[str, str | list], axis: str | None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by gaigs's names, and the names of ignored arrays.
+    """The arrays of a file by gaigs's names, and the names of ignored arrays.
+
+    A ``ValueError`` names the array that could not be read.
 
     Args:
         given: Names of arrays in the file where they differ from gaigs's.
@@ -255,15 +258,16 @@ def _load(
     """
     arrays: dict[str, np.ndarray] = {}
     used: set[str] = set()
-    place = ""
+    place = ""  # start of an error: the array that is read
     form = array_format(file)
     try:
         with form.open(file) as content:
-            has = {*content.names, *given}
-            layouts = RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS
+            present = {*content.names, *given}
+            has_responses = {"a", "tau"} <= present and "h" not in present
+            layouts = RESPONSES if has_responses else ARRAYS
             for name, layout in layouts.items():
                 place = f"{name}: "
-                if name not in has and _is_optional(name, arrays):
+                if name not in present and _is_optional(name, arrays):
                     continue
                 names = _names_in_file(name, given)
                 array = _read_array(content, names, layout, axis)
@@ -283,15 +287,19 @@ def _load(
 
 
 def _is_optional(name: str, arrays: Mapping[str, np.ndarray]) -> bool:
-    """True if a file may lack an array, given those in front of it."""
+    """True if a file may lack an array.
+
+    Args:
+        arrays: Arrays that were read before it, such as ``rx`` before ``rx_index``.
+    """
     if name == "rx_index":
-        # Another shape of rx is an error of its own.
+        # One receiver needs no index. A wrong shape of rx gets its error elsewhere.
         return arrays["rx"].shape[:1] == (1,) or arrays["rx"].shape[1:] != (3,)
     return name == "elements"
 
 
 def _names_in_file(name: str, given: Mapping[str, str | list]) -> list[str]:
-    """The names of an array, or of its real and imaginary part."""
+    """The file's name for an array, or its two names for real and imaginary part."""
     names = given.get(name, name)
     names = [names] if isinstance(names, str) else [*names]
     if len(names) > 1 and not (name in ("h", "a") and len(names) == 2):
@@ -302,7 +310,15 @@ def _names_in_file(name: str, given: Mapping[str, str | list]) -> list[str]:
 def _read_array(
     content: ArrayFile, names: Sequence[str], layout: Layout, axis: str | None
 ) -> np.ndarray:
-    """An array, or two of real and imaginary part joined; a ``ValueError`` if the file has none."""
+    """An array of a file, with real and imaginary part joined.
+
+    Args:
+        names: Name of the array, or names of real and imaginary part.
+        axis: As for ``_load``.
+
+    Raises:
+        ValueError: The file has no array, or several arrays, of a name.
+    """
     for name in names:
         count = content.names.count(name)
         if count != 1:
@@ -329,12 +345,12 @@ def _from_matlab(array: np.ndarray, layout: Layout) -> np.ndarray:
 
 
 def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for arrays unlike their layout.
+    """Raises a ``ValueError`` for arrays with another type or shape than their layout.
 
     The first array with a letter in its shape fixes the letter's size.
     """
-    known: dict[object, int] = {}
-    kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
+    known: dict[object, int] = {}  # size of each letter
+    kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # numpy's letters of data types
     for name, array in arrays.items():
         kind, letters = ARRAYS[name]
         if name == "elements" and array.ndim == 3:
@@ -349,7 +365,7 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"{file}: {name}: expected {kind} numbers, got {got}")
         sizes = tuple(known.get(letter, letter) for letter in letters)
         if not array.size or not _fits(array.shape, sizes):
-            # MATLAB's arrays get a last axis of 1.
+            # Channels of one antenna without the axis of elements: (n, s), or (n, s, 1) by MATLAB.
             is_flat = name == "h" and (array.ndim == 2 or array.shape[-1] == 1)
             hint = "; for one antenna add an axis, h[:, None, :]" if is_flat else ""
             expected = str(sizes).replace("'", "")
@@ -393,7 +409,11 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
-    """A text for errors that says what an array may hold, and True for each allowed number."""
+    """The rule for the numbers of an array: a text for errors, and True for each allowed number.
+
+    Args:
+        receivers: Number of receivers.
+    """
     if name == "h":
         low, high = 1e-18, 1e18  # float32 can hold their squares
         sizes = np.abs(array)
@@ -411,7 +431,12 @@ def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray
 
 
 def _require(file: Path, name: str, array: np.ndarray, expected: str, holds: np.ndarray) -> None:
-    """Raises a ``ValueError`` that names the first number for which a rule does not hold."""
+    """Raises a ``ValueError`` that names the first number for which a rule does not hold.
+
+    Args:
+        expected: The rule as text.
+        holds: True for each number that satisfies the rule.
+    """
     wrong = np.argwhere(~holds)
     if not len(wrong):
         return
@@ -434,7 +459,7 @@ def _move_missing_elements_last(file: Path, arrays: dict[str, np.ndarray]) -> No
     """
     if arrays.get("elements", np.zeros(0)).ndim < 3:
         return
-    missing = np.isnan(arrays["elements"]).all(-1)
+    missing = np.isnan(arrays["elements"]).all(-1)  # (k, e)
     if len(bare := np.flatnonzero(missing.all(1))):
         raise ValueError(
             f"{file}: elements[{bare[0]}]: expected an element of each receiver, got NaN alone"
@@ -444,6 +469,7 @@ def _move_missing_elements_last(file: Path, arrays: dict[str, np.ndarray]) -> No
         raise ValueError(
             f"{file}: h{wrong[0].tolist()}: expected 0 at an element without a position"
         )
-    order = missing.argsort(1, kind="stable")
+    order = missing.argsort(1, kind="stable")  # (k, e), the missing ones last
+    of_links = order[arrays["rx_index"]]  # (n, e)
     arrays["elements"] = np.take_along_axis(arrays["elements"], order[..., None], 1)
-    arrays["h"] = np.take_along_axis(arrays["h"], order[arrays["rx_index"]][..., None], 1)
+    arrays["h"] = np.take_along_axis(arrays["h"], of_links[..., None], 1)

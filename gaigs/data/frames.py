@@ -73,8 +73,10 @@ def from_frame(
     """
     config = split_configuration("data frames", from_frame, split, options)
     table = read_frame(frame)
+    # A frame with the columns of ``rssi_csv`` has both ends of each link.
     if {*COLUMNS} <= {*table.names} and receiver is level is x is None:
         x, y, z, *receiver, level = COLUMNS
+    # Several columns hold the receiver's place: both ends move.
     if isinstance(receiver, Sequence) and not isinstance(receiver, str):
         place = [x or "x", y or "y", z]
         moving = _places_of(table, [name for name in place if name is not None])
@@ -109,7 +111,7 @@ def from_frame(
 
 
 def _places_of(table: Table, names: Sequence) -> Float[np.ndarray, "n d"]:
-    """Positions of one end of the links, from a column for each coordinate."""
+    """Positions of one end of the links [m], from the named column of each coordinate."""
     columns = [table.column(str(name)) for name in names]
     return table.numbers[:, columns]
 
@@ -117,11 +119,15 @@ def _places_of(table: Table, names: Sequence) -> Float[np.ndarray, "n d"]:
 def _columns(table: Table, receivers: Any, ignore: list[str], is_long: bool) -> dict[str, Any]:
     """Options of ``from_table`` for receivers by a mapping, a data frame or a list of columns.
 
+    Args:
+        ignore: Columns that the user excludes.
+        is_long: True for a frame with a row for each reading.
+
     Raises:
         ValueError: A listed name is no column.
     """
     if isinstance(receivers, Mapping) and not {"name", "x", "y"} <= {*receivers}:
-        placed = {}
+        placed = {}  # positions as texts, as a file of gateways has them
         for name, position in receivers.items():
             if position is not None:
                 placed[str(name)] = [*map(str, np.ravel(position).tolist())]
@@ -147,10 +153,14 @@ def _listed(names: str | Sequence) -> list[str]:
 
 
 def _coordinates(table: Table, x: Any, y: Any, z: Any) -> list[str] | None:
-    """Columns of the coordinates; None if all are to be found by their names."""
+    """Names of the columns of x, y and, if there is one, of the height or floor.
+
+    None if no column is given, so that ``from_table`` finds all of them by usual names.
+    """
     if x is y is z is None:
         return None
     heights = [] if z is None else [str(z)]
+    # A height comes before a floor.
     for kinds in (HEIGHTS, FLOORS):
         if not heights:
             heights = [name for name in table.names if plain_name(name)[0] in kinds][:1]

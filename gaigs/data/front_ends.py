@@ -36,9 +36,10 @@ def learn_responses(links: Any, options: FrontEndOptions | None = None) -> Front
     errors = torch.zeros(shape)
     sentences = []
     for receiver, antenna in enumerate(links.receivers):
-        heard = antenna.hears(task.frequencies)
+        heard = antenna.hears(task.frequencies)  # subcarriers in the receiver's band
         rows = train[links.query.receivers[train] == receiver]
-        rows = rows[links.labels[rows].abs().amax((1, 2)) > 0]
+        rows = rows[links.labels[rows].abs().amax((1, 2)) > 0]  # links with a signal
+        # Number of each link's place.
         places = links.query[rows].transmitters.unique(dim=0, return_inverse=True)[1]
         count = len(antenna.array)
         if len(places.unique()) < options.fewest_places or count * heard.sum() < 2:
@@ -63,7 +64,12 @@ def learn_responses(links: Any, options: FrontEndOptions | None = None) -> Front
 def _better_sign(
     links: Any, rows: Tensor, antenna: Receiver, options: FrontEndOptions
 ) -> FrontEndFit:
-    """The fit with the sign of the phases that explains more links, within the receiver's band."""
+    """The fit of a front end with the sign of the phases that explains the channels better.
+
+    Args:
+        rows: Training links to the receiver.
+        antenna: The receiver; only subcarriers in its band are fitted.
+    """
     count = len(antenna.array)
     heard = antenna.hears(links.task.frequencies)
     task = Csi(links.task.elements, links.task.frequencies[heard], links.task.phase)
@@ -79,7 +85,7 @@ def _better_sign(
 
 
 def _summary(front_end: FrontEnd) -> str:
-    """Range of a response's level and its relative error."""
+    """Range of a response's level and its relative error, in words [dB]."""
     levels = 20 * front_end.response.abs().clamp_min(1e-6).log10()
     error = 20 * (front_end.errors.norm() / front_end.response.norm()).log10()
     return f"{levels.min():.1f} to {levels.max():.1f} dB, error {error:.0f} dB"

@@ -51,11 +51,14 @@ def estimate_place(
 ) -> tuple[Float[Tensor, "3"], float]:
     """Place of a gateway [m] from the levels [dBm] that it receives, and the expected error [m].
 
-    The transmitters are at ``places``. Levels follow a + b log10(distance) with correlated
-    shadowing, so many readings at one spot count as few. The prior is uniform in the box of the
-    readings, widened by half its extent. The result is the mean of the posterior. Readings beyond
-    three deviations from the law at the best place are clipped to three. Places without a reading
-    are not used.
+    Levels follow constant + slope log10(distance) with correlated shadowing, so many readings at
+    one spot count as few. The prior is uniform in the box of the readings, widened by half its
+    extent. The result is the mean of the posterior. Readings beyond three deviations from the law
+    at the best place are clipped to three deviations.
+
+    Args:
+        places: Transmitters whose signal was received [m].
+        levels: Level of each transmitter at the gateway [dBm].
 
     Source: Gudmundson, Correlation model for shadow fading in mobile radio systems, 1991; marginal
     likelihood by Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
@@ -67,15 +70,15 @@ def estimate_place(
     levels = levels[index].double()
     low, high = places.amin(0), places.amax(0)
     extent = (high - low).max().item()
-    margin = max(5.0, extent / 2)
+    margin = max(5.0, extent / 2)  # [m]
     low = low - low.new_tensor([margin, margin, 0])
     high = high + low.new_tensor([margin, margin, prior.above])
-    apart = torch.cdist(places, places)
-    apart = apart / max(1.0, extent / prior.site)
-    # Gudmundson: shadowing is correlated by exp(-distance / length); the rest is noise.
-    correlated = [share * (-apart / length).exp() for length, share in prior.correlations]
+    # On a large site correlation lengths grow with the extent, so distances shrink.
+    distances = torch.cdist(places, places) / max(1.0, extent / prior.site)  # (n, n)
+    # Gudmundson: a share of shadowing is correlated by exp(-distance / length), the rest is noise.
+    correlated = [share * (-distances / length).exp() for length, share in prior.correlations]
     shadowing = torch.stack(correlated)  # (c, n, n)
-    shadowing.diagonal(dim1=1, dim2=2).fill_(1)
+    shadowing.diagonal(dim1=1, dim2=2).fill_(1)  # the variance of shadowing and noise together
     factors = torch.linalg.cholesky(shadowing)
     lower, upper = low, high
     for _ in range(prior.rounds):
@@ -86,16 +89,17 @@ def estimate_place(
         laws = _fit_laws(factors, decades, levels, prior)
         probabilities = laws.evidence.flatten().softmax(0).reshape(laws.evidence.shape)  # (c, g)
         best = int(probabilities.argmax()) % len(candidates)
+        # Posterior of the place, over all correlations.
         shares = probabilities.sum(0)  # (g,)
         place = shares @ candidates
         deviations = (shares @ (candidates - place).square()).sqrt()
         # Readings far from the best law are pulled in to three deviations.
-        which = int(probabilities[:, best].argmax())
-        law = laws.constants[which, best] + laws.slopes[which, best] * decades[:, best]
+        c = int(probabilities[:, best].argmax())  # most probable correlation
+        law = laws.constants[c, best] + laws.slopes[c, best] * decades[:, best]
         errors = levels - law
         bound = 3 * max(1.0, 1.4826 * errors.abs().median().item())
         levels = law + errors.clamp(-bound, bound)
-        # The next grid is finer, around the mean.
+        # The next grid is finer, around the mean; half its width is at least one step of this one.
         half = torch.maximum(3 * deviations, (upper - lower) / (prior.across - 1))
         lower = torch.maximum(low, place - half)
         upper = torch.minimum(high, place + half)
@@ -111,7 +115,8 @@ def _fit_laws(
     """Laws of each candidate for each correlation, with their log likelihood.
 
     The likelihood is integrated over all laws and variances. The prior of the slope enters as one
-    more observation.
+    more observation. With whitened columns 1 (of the constant), x (logarithms) and y (levels),
+    least squares give slope = S_xy / S_xx, where S_xy = x'y - (1'x) (1'y) / (1'1).
 
     Args:
         factors: Cholesky factors of c correlations of the shadowing at n places.
@@ -122,23 +127,25 @@ def _fit_laws(
     columns = columns.expand(len(factors), -1, -1)  # (c, n, 2 + g)
     # Whitened by the Cholesky factors, generalised least squares become ordinary ones.
     white = torch.linalg.solve_triangular(factors, columns, upper=False)
-    one, level, logs = white.tensor_split([1, 2], dim=2)
-    # The prior of the slope as an observation of this weight; the constant has none.
+    one, y, x = white.tensor_split([1, 2], dim=2)  # (c, n, 1), (c, n, 1), (c, n, g)
+    # The prior of the slope is an observation of this weight; the constant has no prior.
     weight = (prior.shadowing / prior.slope_deviation) ** 2
-    ones = one.square().sum(1)  # (c, 1)
-    mixed = (one * logs).sum(1)  # (c, g)
-    means = (one * level).sum(1)  # (c, 1)
-    squares = logs.square().sum(1) + weight - mixed.square() / ones
-    products = (logs * level).sum(1) + weight * prior.slope - mixed * means / ones
+    one_one = one.square().sum(1)  # (c, 1)
+    one_x = (one * x).sum(1)  # (c, g)
+    one_y = (one * y).sum(1)  # (c, 1)
+    s_xx = x.square().sum(1) + weight - one_x.square() / one_one  # (c, g)
+    s_xy = (x * y).sum(1) + weight * prior.slope - one_x * one_y / one_one  # (c, g)
     unexplained = (
-        level.square().sum(1)
+        y.square().sum(1)
         + weight * prior.slope**2
-        - means.square() / ones
-        - products.square() / squares
+        - one_y.square() / one_one
+        - s_xy.square() / s_xx
     )
-    slopes = products / squares
-    log_determinants = factors.diagonal(dim1=1, dim2=2).log().sum(1, keepdim=True)
-    size = log_determinants + (ones.log() + squares.log()) / 2
+    slopes = s_xy / s_xx
+    # Without constant, slope and variance, the density is |K|^-1/2 (1'1 S_xx)^-1/2 R^-n/2, with the
+    # correlation K of the shadowing, n readings and the unexplained sum of squares R.
+    log_determinants = factors.diagonal(dim1=1, dim2=2).log().sum(1, keepdim=True)  # (c, 1)
+    log_norm = log_determinants + (one_one.log() + s_xx.log()) / 2
     least = prior.noise**2 * len(levels)
-    evidence = -size - len(levels) / 2 * unexplained.clamp_min(least).log()
-    return Laws(evidence, slopes, (means - slopes * mixed) / ones)
+    evidence = -log_norm - len(levels) / 2 * unexplained.clamp_min(least).log()
+    return Laws(evidence, slopes, (one_y - slopes * one_x) / one_one)

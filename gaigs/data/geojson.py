@@ -22,9 +22,12 @@ Rings = list[Float[ndarray, "_ d"]]
 def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Rings, dict]]:
     """The polygons of a file, with corners (k, 3) in the world frame [m] and their properties.
 
-    With a frame, positions are longitude and latitude, or easting and northing; otherwise metres of
-    the world frame. Missing heights are NaN. ``mend`` is the advice in errors, such as "draw
-    buildings".
+    Missing heights are NaN.
+
+    Args:
+        frame: Place of the world frame on a map. Positions in the file are then longitude and
+            latitude, or easting and northing. None: they are metres of the world frame.
+        mend: Advice in errors, such as "draw buildings".
 
     Source: RFC 7946.
     """
@@ -53,7 +56,7 @@ def read_buildings(
     """
     file = find_file(file, "buildings", "buildings")
     buildings = []
-    lacking = 0
+    lacking = 0  # number of buildings without a height
     for rings, properties in read_polygons(file, frame, "draw buildings"):
         above = _number(properties.get("height"), height)
         lacking += above is None

@@ -17,14 +17,14 @@ def to_channels(
     delays: Float[np.ndarray, "n d p"],
     offsets: Float[np.ndarray, " s"],
 ) -> Complex[np.ndarray, "n e s"]:
-    """Channels sum_p g_p exp(-j 2 pi f t_p), complex64.
-
-    Gains include the phase at the carrier.
+    """Channels sum_p g_p exp(-j 2 pi f t_p) of paths p, complex64.
 
     Args:
-        gains: Baseband-equivalent gain of each path at each element; 0 for a missing path.
-        delays: Delay of each path [s], common to all elements (d = 1) or for each element (d = e).
-        offsets: Subcarriers relative to the carrier [Hz].
+        gains: Gain g of each path at each element, with its phase at the carrier; 0 for a missing
+            path.
+        delays: Delay t of each path [s], common to all elements (d = 1) or for each element
+            (d = e).
+        offsets: Subcarriers f relative to the carrier [Hz].
 
     Example:
         >>> from gaigs.data.impulse_responses import to_channels
@@ -33,14 +33,15 @@ def to_channels(
         >>> to_channels(gains, delays, np.array([0.0, 2.5e6])).round(3)
         array([[[1. +0.5j, 1.5+0.j ]]], dtype=complex64)
     """
-    # The waves of all paths take many times the memory of their sums.
+    # Some links at a time: the waves of all paths take many times the memory of their sums.
     links = 256
     channels = np.zeros((*gains.shape[:2], len(offsets)), np.complex64)
     for first in range(0, len(gains), links):
         part = slice(first, first + links)
         turns = delays[part, ..., None].astype(float) * offsets
         waves = np.exp(-2j * np.pi * turns)  # (k, d, p, s)
-        channels[part] = (gains[part, :, None] @ waves)[:, :, 0]
+        sums = gains[part, :, None] @ waves  # (k, e, 1, s)
+        channels[part] = sums[:, :, 0]
     return channels
 
 
@@ -50,29 +51,36 @@ def lacks_carrier(
     frequency: float,
     otherwise: bool = False,
 ) -> bool:
-    """True if the gains ``fields`` of lines of sight lack the phase of their delay at the carrier.
+    """True if the gains of direct paths lack the phase of their delay at the carrier.
 
-    Gains of some ray tracers lack it, and all their phases are then similar. With fewer than ten
-    lines of sight the result is ``otherwise``.
+    Gains of some ray tracers lack this phase, and the phases of all direct paths are then similar.
+
+    Args:
+        fields: Complex gain of the direct path of each link.
+        delays: Delay of these paths [s].
+        frequency: Carrier [Hz].
+        otherwise: Result for fewer than ten direct paths.
     """
     if len(fields) < 10:
         return otherwise
     units = fields / np.abs(fields)
-    # Magnitudes of the mean phasors, as given and without the carrier's phase; 1 for equal phases.
-    alike = abs(units.mean())
-    included = abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
-    return bool(alike > max(0.9, included))
+    # Magnitude of the mean phasor is 1 for equal phases. If gains have the carrier's phase, phases
+    # are equal after it is removed; otherwise they are equal as given.
+    as_given = abs(units.mean())
+    without_carrier = abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
+    return bool(as_given > max(0.9, without_carrier))
 
 
 class Responses(NamedTuple):
-    """Impulse responses between places."""
+    """Impulse responses of p paths from n transmitters to k receivers.
 
-    # Complex gains of p paths; k receivers have e antennas, n transmitters m.
-    gains: Complex[ndarray, "k e n m p"]
-    delays: ndarray  # the same, or with a 1 for the antennas [s]
-    # Places of both ends (n, 3), (k, 3) [m].
-    tx: ndarray
-    rx: ndarray
+    A transmitter has m antennas, a receiver has e.
+    """
+
+    gains: Complex[ndarray, "k e n m p"]  # complex gain of each path
+    delays: ndarray  # (k, e, n, m, p), or (k, 1, n, 1, p) if common to all antennas [s]
+    tx: ndarray  # places of the transmitters (n, 3) [m]
+    rx: ndarray  # places of the receivers (k, 3) [m]
 
 
 def from_sionna(
@@ -81,9 +89,9 @@ def from_sionna(
     """Arrays of ``gaigs.data.csi_npz`` from impulse responses of Sionna RT, and remarks.
 
     ``sionna.rt.Paths.cir`` gives these responses. Gains of ``sionna.rt.Paths.a`` lack the phase of
-    the delay at the carrier; it is then added. ``lacks_carrier`` recognises such gains by the links
-    in line of sight, whose first delay is the distance over the speed of light. By reciprocity the
-    end with fewer places becomes the fixed end; in a tie the receivers.
+    the delay at the carrier, which is then added. ``lacks_carrier`` recognises such gains by the
+    links in line of sight: their first delay is the distance over the speed of light. By
+    reciprocity the end with fewer places becomes the fixed end; in a tie the receivers.
 
     Args:
         arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), for k receivers
@@ -103,16 +111,17 @@ def from_sionna(
     frequencies = subcarriers + (carrier if is_relative else 0.0)
     distances = np.linalg.norm(tx[:, None] - rx, axis=2).reshape(-1)  # (links,)
 
-    # Distances are from the receiver's position, so its nearest element represents the array.
-    near = 0
+    # Distances are from the receiver's position. The element nearest to it represents the array.
+    central = 0
     if "elements" in arrays and arrays["elements"].ndim == 2:
-        near = int(np.linalg.norm(arrays["elements"], axis=1).argmin())
-    fields = gains[:, near]  # (links, p)
-    times = delays[:, min(near, delays.shape[1] - 1)]
+        central = int(np.linalg.norm(arrays["elements"], axis=1).argmin())
+    fields = gains[:, central]  # (links, p)
+    times = delays[:, min(central, delays.shape[1] - 1)]  # common delays have one element
+    # The first path of each link.
     first = np.where(fields != 0, times, np.inf).argmin(1, keepdims=True)  # (links, 1)
     fields = np.take_along_axis(fields, first, 1)[:, 0]
     times = np.take_along_axis(times, first, 1)[:, 0]
-    excess = np.abs(times * speed_of_light - distances)
+    excess = np.abs(times * speed_of_light - distances)  # length beyond the distance [m]
     is_direct = (fields != 0) & (excess < 0.1 + 1e-3 * distances)
     remarks = []
     if lacks_carrier(fields[is_direct], times[is_direct], carrier):
@@ -143,7 +152,10 @@ def _read_carrier(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
-    """Impulse responses of arrays; real and imaginary part are joined, and shapes are checked."""
+    """Impulse responses of the arrays that ``from_sionna`` describes.
+
+    Real and imaginary part may also be along a first axis of 2. A ``ValueError`` for other shapes.
+    """
     a, tau, tx, rx = (arrays[name] for name in ("a", "tau", "tx", "rx"))
     if a.dtype.kind == "f" and a.ndim == 7 and len(a) == 2:
         a = a[0] + 1j * a[1]
@@ -156,7 +168,7 @@ def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
     a = a[..., 0]  # (k, e, n, m, p)
     check_parts("a", a[a != 0])
     delays = tau[:, None, :, None] if tau.ndim == 3 else tau
-    shared = (a.shape[0], 1, a.shape[2], 1, a.shape[4])  # the delays of a synthetic array
+    shared = (a.shape[0], 1, a.shape[2], 1, a.shape[4])  # delays common to all antennas
     fits = tx.shape == (a.shape[2], 3) and rx.shape == (a.shape[0], 3)
     if not fits or delays.shape not in (a.shape, shared):
         expected = f"tx {(a.shape[2], 3)}, rx {(a.shape[0], 3)}"
@@ -168,13 +180,19 @@ def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
 
 
 def _without_missing_delays(responses: Responses, needs_delays: bool) -> Responses:
-    """Responses with delays of 0 for missing paths; a ``ValueError`` for wrong delays."""
+    """Responses with delays of 0 for missing paths, whose gain is 0.
+
+    Raises:
+        ValueError: A delay is out of range, or ``needs_delays`` is true and delays count from the
+            first path in place of the transmission.
+    """
     gains = responses.gains
     exists = gains != 0
     delays = np.where(exists, responses.delays, 0)
     if not ((delays >= 0) & (delays < 1e-3)).all():
         raise ValueError("tau: expected a delay of 0 to 1 ms in seconds where a is not 0")
     if needs_delays and exists.any():
+        # Delays from the first path are 0 for the first path of every link.
         earliest = np.where(exists, responses.delays, np.inf).min(-1)  # (k, e, n, m)
         if not earliest[exists.any(-1)].any():
             raise ValueError(

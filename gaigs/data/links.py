@@ -67,7 +67,7 @@ def links(source: Any = None, /, **options: Any) -> Links:
 
 
 def _checked(reader: Callable, options: Mapping) -> Callable:
-    """The reader of data in memory; raises a ``TypeError`` for an option of a wrong type."""
+    """The reader itself, after a check of its options; a ``TypeError`` for a wrong type."""
     for key, parameter in inspect.signature(reader).parameters.items():
         if key in options and options[key] is not parameter.default:
             check_type(key, options[key], parameter.annotation)

@@ -51,6 +51,7 @@ def are_degrees(points: Float[ndarray, "n d"]) -> bool:
         return False
     x, y = np.abs(points[:, :2]).max(0)
     span = np.ptp(points[:, :2], axis=0).max()
+    # One coordinate is within 180 degrees and the other within 90, in either order.
     is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
     is_small = 0 < span < min(0.3, max(x, y) / 100)
     beyond_four = np.abs(points[:, :2] - points[:, :2].round(4))  # the fifth decimal and further
@@ -93,6 +94,7 @@ def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 
         lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(
             x, y, errcheck=True
         )
+        # Zones are 6 degrees wide from -180; codes are 32601.. in the north, 32701.. in the south.
         utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
         east, north = points.T
         moved = pyproj.Transformer.from_crs(epsg, utm, always_xy=True).transform(

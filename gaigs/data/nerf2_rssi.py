@@ -91,7 +91,10 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
 
 
 def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list[list[float]]]:
-    """The gateway of each column, and the readings [dBm] of each row."""
+    """The gateway of each column, and the readings [dBm] of each row.
+
+    Without a heading, columns are in the order of ``gateways``.
+    """
     lines = tables.read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
     delimiter = tables.find_delimiter(lines)
     first = tables.split_cells(lines[0], delimiter)
@@ -125,13 +128,20 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
 def _read_official(
     root: Path, received: Bool[Tensor, "rows gateways"], names: Sequence[str]
 ) -> Parts:
-    """Training and test links from index files, which list rows, or pairs of row and gateway."""
+    """Training and test links from index files, which list rows, or pairs of row and gateway.
+
+    Args:
+        root: Folder of the index files.
+        received: True for each reading that was received; links are these readings, row by row.
+        names: Gateway of each column.
+    """
     columns = {name: k for k, name in enumerate(names)}
     # A gateway has its column's number as a second name, unless names are numbers.
     if not any(name.isdecimal() for name in names):
         columns |= {str(k): k for k in range(len(names))}
 
     def parse(line: str) -> tuple[int | None, ...] | None:
+        """The row, or row and column, of a line; None for an unknown one."""
         row, *column = re.split(r"\s*,\s*|\s+", line, maxsplit=1)
         entry = tables.to_index(row), *(columns.get(name) for name in column)
         return None if None in entry or entry[0] >= len(received) else entry

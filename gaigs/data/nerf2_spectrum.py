@@ -36,9 +36,10 @@ def read(
     frequency: float | None = 920e6,
     bandwidth: float | None = None,
 ) -> Links:
-    """A data set from its folder. Images are decoded on request; all other files are checked here.
+    """A data set of spectra from its folder.
 
-    If each link has its own carrier, the links of one position share a row.
+    Images are decoded on request; all other files are checked here. If each link has its own
+    carrier, the links of one position share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official
@@ -72,7 +73,7 @@ def read(
     receiver = _read_receiver(root / "gateway_info.yml")
     files = _find_images(root, len(positions))
     carriers = root / "freq.txt"
-    has_own = tables.has_file(carriers)
+    has_own = tables.has_file(carriers)  # each link has its own carrier
     frequencies = None if frequency is None else torch.full((len(files),), float(frequency))
     remarks = []
     if has_own:

@@ -54,7 +54,7 @@ def check_parts(name: str, channels: ndarray) -> None:
     parts = {"real": channels.real, "imaginary": channels.imag}
     for amplitudes, phases in (("real", "imaginary"), ("imaginary", "real")):
         is_db = parts[amplitudes].max() < -20
-        if not is_db and parts[amplitudes].min() < 0:
+        if not is_db and parts[amplitudes].min() < 0:  # these numbers are no amplitudes
             continue
         for turn, angle in ((2 * math.pi, "p"), (360.0, "np.deg2rad(p)")):
             if not _fills_turn(parts[phases], turn):
@@ -69,15 +69,21 @@ def check_parts(name: str, channels: ndarray) -> None:
 
 
 def _fills_turn(angles: ndarray, turn: float) -> bool:
-    """True if numbers are evenly spread over a full turn, from 0 or from minus half a turn."""
+    """True if numbers are evenly spread over a full turn, from 0 or from minus half a turn.
+
+    Args:
+        turn: Full turn, in the unit of the angles.
+    """
     low = angles.min()
     high = angles.max()
     start = 0 if low >= 0 else -turn / 2
+    # Tolerances of the ends, towards the inside and the outside of the turn.
     inner = 0.05 * turn
     outer = 1e-6 * turn
     if not start - outer <= low < start + inner:
         return False
     if not start + turn - inner < high <= start + turn + outer:
         return False
-    # The deviation of even angles; sines of a phase near 0 have 1.2 of it.
+    # Evenly spread angles have a standard deviation of turn / sqrt(12). Sines of a phase, from a
+    # channel's imaginary part, have 1.2 times as much.
     return bool(abs(angles.std() / (turn / math.sqrt(12)) - 1) < 0.12)

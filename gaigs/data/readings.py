@@ -55,16 +55,24 @@ def to_dbm(
     not_heard: Sequence[float],
     mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm], each a value of ``not_heard`` or at least ``lowest``.
+    """Cells of a table as readings [dBm].
 
-    Raises a ``ValueError`` for any other cell. ``mend`` is its advice on other values that mean
-    "not heard".
+    Args:
+        file: File of the table, for errors.
+        rows: Cells of each line; a unit dBm in a cell is dropped.
+        names: Names of the columns.
+        lowest: Lowest valid reading [dBm].
+        not_heard: Values that mean "not heard", also outside the bounds [dBm].
+        mend: Advice in the error if other values seem to mean "not heard".
+
+    Raises:
+        ValueError: A cell is neither a valid reading nor a value of ``not_heard``.
     """
     cells = {}
     for line, texts in rows.items():
         cells[line] = [re.sub(r"(?i)\s*dbm$", "", text) for text in texts]
 
-    def holds(value):
+    def is_valid(value: float) -> bool:
         return value in not_heard or lowest <= value <= LOUDEST
 
     expected = (
@@ -72,7 +80,7 @@ def to_dbm(
         "heard)"
     )
     try:
-        return to_numbers(file, cells, names, holds, expected)
+        return to_numbers(file, cells, names, is_valid, expected)
     except ValueError as error:
         levels = np.array([[*map(to_number, texts)] for texts in cells.values()])
         others = [mark for mark in marks_of(levels) if mark not in not_heard]
@@ -92,17 +100,18 @@ def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     Names without a match are dropped.
     """
 
-    def plain(name):
+    def plain(name: str) -> str:
         return re.sub(r"[\s_:-]", "", name.casefold())
 
+    # Only a spelling that occurs once among the names and once among the known ones is a match.
     spelt = Counter(map(plain, names))
-    alike = Counter(map(plain, known))
+    known_spelt = Counter(map(plain, known))
     by_letters = {plain(name): name for name in known}
     matched = {}
     for name in names:
         if name in known:
             matched[name] = name
-        elif alike[plain(name)] == 1 == spelt[plain(name)]:
+        elif known_spelt[plain(name)] == 1 == spelt[plain(name)]:
             matched[name] = by_letters[plain(name)]
     return matched
 
@@ -114,9 +123,11 @@ def suggested(name: str, others: Iterable[str]) -> str:
 
 
 def and_list(numbers: Iterable[float]) -> str:
-    """Ascending numbers in words: 0, 60 and 102."""
+    """Numbers in ascending order as text, such as ``0, 60 and 102``; empty without numbers."""
     words = [f"{number:g}" for number in sorted(numbers)]
-    return " and ".join(filter(None, (", ".join(words[:-1]), *words[-1:])))
+    if len(words) < 2:
+        return "".join(words)
+    return f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
@@ -156,13 +167,17 @@ def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
     """Values that mean "not heard", as in ``marks_of``: usual marks, or the ``lowest`` value.
 
     Such a value is apart from all others, or much more frequent than its neighbours.
+
+    Args:
+        levels: Readings, without columns of one value [dBm].
+        lowest: Lowest value among all readings, also of other columns [dBm].
     """
     usual = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)  # marks of "not heard" [dBm]
     values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
     marks = []
     for value in values[np.isin(values, [*usual, lowest])].tolist():
         count = counts[values == value][0]
-        near = counts[(values != value) & (np.abs(values - value) < 5)]
+        near = counts[(values != value) & (np.abs(values - value) < 5)]  # within 5 dB
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
         is_alone = (np.abs(values - value) <= 10).sum() == 1
         is_apart = False
@@ -177,18 +192,23 @@ def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
 
 
 def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list[float]:
-    """The lowest values, at most three, if more than 10 dB below all others."""
+    """Marks by the last case of ``marks_of``: lowest values, more than 10 dB below all others.
+
+    Args:
+        levels: Readings, without columns of one value [dBm].
+        marks: Marks by the other cases, which are left out of the result.
+    """
     values = np.unique(levels[~np.isnan(levels)])
-    gaps = np.flatnonzero(np.diff(values[:4]) > 10)
+    gaps = np.flatnonzero(np.diff(values[:4]) > 10)  # at most three values are below a gap
     if not len(gaps):
         return []
-    last = gaps[-1]
+    last = gaps[-1]  # number of the highest value below the gap
     lowest = []
     for value in values[: last + 1].tolist():
         # A mark occurs with true levels in several columns. A column of only low values is a
         # weak receiver's.
-        mixed = (levels == value).any(0) & (levels > values[last]).any(0)  # (k,)
-        if value not in marks and (levels == value).sum() >= 3 and mixed.sum() >= 2:
+        is_mixed = (levels == value).any(0) & (levels > values[last]).any(0)  # (k,)
+        if value not in marks and (levels == value).sum() >= 3 and is_mixed.sum() >= 2:
             lowest.append(value)
     return lowest
 

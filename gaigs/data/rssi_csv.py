@@ -78,8 +78,10 @@ def read(
     points, dbm, ignored = _read_table(file, marks)
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 
+    # Distinct places of each end, and the number of the place of each reading.
     numbered = {end: tables.number_places(points[end]) for end in ENDS}
-    fixed = fixed or ("rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx")
+    if fixed is None:
+        fixed = "rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx"
     moving = "tx" if fixed == "rx" else "rx"
     places, place_numbers = numbered[fixed]
     received = torch.tensor([value not in marks for value in dbm])
@@ -128,7 +130,7 @@ def write(folder: str | Path, links: Links) -> None:
 
 
 def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[float], list[str]]:
-    """Positions of both ends [m], readings [dBm], and the names of other columns."""
+    """Positions of both ends by their name [m], readings [dBm], and the names of other columns."""
     lines = tables.read_lines(file, f"a heading with {','.join(COLUMNS)}")
     delimiter = tables.find_delimiter(lines)
     written = tables.split_cells(lines[0], delimiter)

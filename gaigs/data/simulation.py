@@ -61,6 +61,7 @@ def simulate_spectra(
     for receiver, carrier in itertools.product(receivers, carriers):
         responses = room.respond(places, receiver, carrier, offsets)
         labels.append(to_spectra(responses, grid, receiver.array, carrier))
+    # Links are sorted by place, then by receiver, then by carrier.
     rows = torch.arange(transmitters).repeat_interleave(len(labels))
     numbers = torch.arange(len(receivers)).repeat_interleave(len(carriers))
     links = Links(
@@ -106,7 +107,7 @@ def simulate_channels(
 
     A channel's squared magnitude is the power that an element receives of unit power sent, between
     antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise. Unless
-    ``phase`` is known, links are distorted at random as a receiver would.
+    ``phase`` is known, each link gets random distortions as a receiver without synchronisation has.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
@@ -123,6 +124,7 @@ def simulate_channels(
     if phase != "known":
         has_delays = phase == "per_link_and_delay"
         labels = _distort(labels, offsets, bandwidth if has_delays else None, seed)
+    # Links are sorted by place, then by receiver.
     rows = torch.arange(transmitters).repeat_interleave(len(receivers))
     numbers = torch.arange(len(receivers)).repeat(transmitters)
     links = Links(
@@ -143,25 +145,33 @@ def _distort(
     bandwidth: float | None,
     seed: int,
 ) -> Complex[Tensor, "n elements f"]:
-    """Channels with a random phase for each link.
+    """Channels with a random phase for each link, and optionally a random delay and gain.
 
-    With a bandwidth [Hz] each link also gets a delay of at most two over the bandwidth, and a gain
-    of -6 to 6 dB.
+    Args:
+        offsets: Subcarriers relative to the carrier [Hz].
+        bandwidth: Width of the band [Hz]. Delays lie within two over the bandwidth of 0, gains in
+            -6 to 6 dB. None: phases only.
+        seed: Seed of the data.
     """
-    sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
+    # Random numbers that are independent of the places, which use ``seed`` itself.
+    sequence = np.random.SeedSequence((seed % 2**64, 2))
     (state,) = sequence.generate_state(1, np.uint64)
     generator = torch.Generator().manual_seed(int(state) % 2**63)
     draws = 2 * torch.rand(3, len(labels), 1, 1, generator=generator, dtype=torch.float64) - 1
-    turns, delays, gains = draws  # (n, 1, 1) each
+    turns, delays, gains = draws  # uniform in -1..1, (n, 1, 1) each
     angles = math.pi * turns
     if bandwidth is not None:
+        # The phase 2 pi f t of a delay t of up to 2 / bandwidth.
         angles = angles + 4 * math.pi / bandwidth * delays * offsets
-        labels = 10 ** (0.3 * gains) * labels
+        labels = 10 ** (0.3 * gains) * labels  # 6 dB are a factor of 10^0.3
     return labels * torch.polar(torch.ones_like(angles), angles)
 
 
 def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]) -> Links:
-    """Links for which a path exists; the remarks count the others."""
+    """Links with a path; the remarks count the others.
+
+    A ``ValueError`` if fewer than two of the ``transmitters`` places have a path.
+    """
     if has_path.all():
         return links
     if len(links.rows[has_path].unique()) < 2:
@@ -225,7 +235,10 @@ def simulate_readings(
 def spectrum_offsets(
     spectrum: str, sample: Callable[[float], Tensor], bandwidth: float
 ) -> Float[Tensor, " f"]:
-    """Frequencies of a spectrum, ``band`` or ``carrier``, relative to the carrier [Hz]."""
+    """Frequencies over which a spectrum's power is averaged, relative to the carrier [Hz].
+
+    ``sample`` gives the frequencies of a band; the spectrum ``carrier`` has the carrier alone.
+    """
     if spectrum not in ("band", "carrier"):
         raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
     return sample(bandwidth) if spectrum == "band" else torch.zeros(1)
@@ -239,7 +252,10 @@ def patch_arrays(poses: Sequence[Pose], frequency: float) -> tuple[Receiver, ...
 
 
 def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:
-    """Official parts of links by the transmitter of each: the last fifth of these tests."""
+    """Official training and test links: the last fifth of the transmitter places is for the test.
+
+    ``rows`` has the number of each link's place.
+    """
     training = transmitters - max(1, round(transmitters / 5))
     return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
 
@@ -266,18 +282,19 @@ def wall_poses(
         height = 1.2 + 1.4 * (0.618034 * number % 1)
         walls = outline(height)
         corners = _inset(walls, 0.1)
-        sides = (corners.roll(-1, 0) - corners).norm(dim=1)
-        ends = sides.cumsum(0)
+        sides = (corners.roll(-1, 0) - corners).norm(dim=1)  # lengths [m]
+        ends = sides.cumsum(0)  # length of the way from the first corner to the end of each side
         while True:  # furniture moves a receiver along its wall
             along = share % 1 * ends[-1]
             side = int(torch.searchsorted(ends, along))
-            along_side = 1 - (ends[side] - along) / sides[side]
+            along_side = 1 - (ends[side] - along) / sides[side]  # share of the side
             place = torch.lerp(corners[side], corners[(side + 1) % len(corners)], along_side)
             position = torch.cat((place, place.new_tensor([height])))
             if is_free(position[None]).all():
                 break
             share += 0.005
         middle = torch.cat((_centroid(walls), torch.ones(1, dtype=torch.float64)))
+        # The array looks along its z axis, the normal; its x axis is horizontal.
         normal = torch.nn.functional.normalize(middle - position, dim=0)
         across = torch.linalg.cross(normal.new_tensor([0.0, 0.0, 1.0]), normal)
         across = torch.nn.functional.normalize(across, dim=0)
@@ -289,13 +306,15 @@ def wall_poses(
 def _inset(corners: Float[Tensor, "w 2"], gap: float) -> Float[Tensor, "w 2"]:
     """Corners of a counterclockwise polygon whose sides have moved inwards by a gap [m]."""
     sides = torch.nn.functional.normalize(corners.roll(-1, 0) - corners, dim=1)
-    after = torch.stack((-sides[:, 1], sides[:, 0]), 1)  # inward normals
+    # Inward unit normals of the sides after and before each corner.
+    after = torch.stack((-sides[:, 1], sides[:, 0]), 1)
     before = after.roll(1, 0)
+    # A corner moves by a vector v with v'after = v'before = gap.
     return corners + gap * (before + after) / (1 + (before * after).sum(1, keepdim=True))
 
 
 def _centroid(corners: Float[Tensor, "w 2"]) -> Float[Tensor, "2"]:
-    """Centroid of a polygon's area [m]."""
+    """Centroid of a polygon's area [m], by the shoelace formula."""
     after = corners.roll(-1, 0)
     areas = corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]  # twice those of triangles
     return areas @ (corners + after) / (3 * areas.sum())
@@ -308,7 +327,7 @@ def draw_places(
     count: int,
     seed: int,
 ) -> Float[Tensor, "count 3"]:
-    """Random places [m], two or more, uniform over the free part of a box."""
+    """Random places [m], two or more, uniform over the part of a box where ``is_free`` is true."""
     if count < 2:
         raise ValueError(
             f"transmitters must be at least 2, one to train and one to test on, got {count}"

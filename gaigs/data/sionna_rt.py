@@ -21,7 +21,10 @@ def is_traced(source: object) -> bool:
 
 
 def _has(source: object, *names: str) -> bool:
-    """True if the class of an object has all attributes: an object computes them when asked."""
+    """True if the class of an object has all attributes.
+
+    The object itself would compute an attribute when asked.
+    """
     return all(hasattr(type(source), name) for name in names)
 
 
@@ -77,7 +80,7 @@ def from_sionna_rt(
     gains, delays = source.cir(normalize_delays=False, out_type="numpy")
     if frequencies is None:
         powers = np.square(np.abs(gains[..., 0])).sum(-1)  # (k, e, n, m)
-        levels = _decibels(powers.mean((1, 3)))  # (k, n)
+        levels = _decibels(powers.mean((1, 3)))  # mean over antennas (k, n)
         ends = {"transmitters": rx.mean(1), "receivers": tx.mean(1)}
         if len(rx) <= len(tx):
             ends = {"transmitters": tx.mean(1), "receivers": rx.mean(1)}
@@ -92,7 +95,7 @@ def from_sionna_rt(
         "frequencies": np.ravel(np.array(frequencies, float)),
     }
     offsets = _elements(source, rx, tx, carrier) if elements is None else np.array(elements, float)
-    count = gains.shape[1 if len(rx) <= len(tx) else 3]
+    count = gains.shape[1 if len(rx) <= len(tx) else 3]  # antennas at the fixed end
     # With two polarisations several antennas share an element.
     is_known = elements is not None or count == offsets.shape[1] > 1
     if is_known:
@@ -119,7 +122,7 @@ def _elements(
 
 
 def _of_map(source: Any, receivers: Any, carrier: float | None, config: Mapping) -> Links:
-    """Links of the cells of a radio map."""
+    """Links of the cells of a radio map, at a carrier [Hz], with a split's configuration."""
     levels = _decibels(1e3 * np.array(source.rss))  # (k, ...) [dBm]
     levels = levels.reshape(len(levels), -1).T  # (cells, k)
     if receivers is None:
@@ -144,11 +147,12 @@ def _of_map(source: Any, receivers: Any, carrier: float | None, config: Mapping)
 
 def _places(points: Any, count: int) -> Float[ndarray, "k e 3"]:
     """Positions of the e antennas at ``count`` places, from (3, count * e) of Sionna RT."""
-    return np.array(points, float).reshape(3, -1).T.reshape(count, -1, 3)
+    positions = np.array(points, float).reshape(3, -1).T  # (count * e, 3)
+    return positions.reshape(count, -1, 3)
 
 
 def _decibels(powers: Float[ndarray, "*shape"]) -> Float[ndarray, "*shape"]:
     """Powers in decibels; NaN for a power of 0."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore"):  # the logarithm of 0 is replaced below
         levels = 10 * np.log10(powers)
     return np.where(powers > 0, levels, np.nan)

@@ -25,7 +25,10 @@ class Extent(NamedTuple):
 
 
 def read_extent(file: str | Path, frame: Frame | None) -> Extent:
-    """The area that a file covers; see ``read_ground``."""
+    """The area that a terrain file covers, in the world frame [m].
+
+    File and frame are as for ``read_ground``.
+    """
     rasterio = find_rasterio()
     with _open(rasterio, file) as raster:
         source, target, origin = _systems(raster, frame)
@@ -33,20 +36,25 @@ def read_extent(file: str | Path, frame: Frame | None) -> Extent:
             transform, columns, rows = rasterio.warp.calculate_default_transform(
                 source, target, raster.width, raster.height, *raster.bounds
             )
-    cell = transform.a
+    cell = transform.a  # pixel size; (c, f) is the upper left corner
     upper = np.array([transform.c + columns * cell, transform.f]) - origin
-    return Extent(upper - cell * np.array([columns, rows]), upper, cell)
+    lower = upper - cell * np.array([columns, rows])
+    return Extent(lower, upper, cell)
 
 
 def read_ground(
     file: str | Path, frame: Frame | None, grid: SiteGrid
 ) -> tuple[Float[ndarray, "rows columns"], Bool[ndarray, "rows columns"]]:
-    """Heights of the ground at the middles of a grid's cells [m], and whether the file has them.
+    """Heights of the ground at the middles of a grid's cells [m].
 
-    Heights are the file's first band with its scale and offset, linear between pixels. A cell
-    without one gets the nearest height. With a frame, the file's coordinate system is converted to
-    that of the frame, and a file without a system has the frame's. Without a frame, coordinates are
-    metres of the world frame.
+    The second result is true for cells whose height the file has. Heights are the file's first band
+    with its scale and offset, linear between pixels. A cell without a height gets the nearest one.
+
+    Args:
+        frame: Place of the world frame on a map. Coordinates of the file are converted to the
+            frame's system; a file without a system has the frame's. None: coordinates of the file
+            are metres of the world frame.
+        grid: Cells, in the world frame.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -79,6 +87,7 @@ def read_ground(
             f"{file}: heights from {np.nanmin(heights):.0f} to {np.nanmax(heights):.0f} m are no "
             "ground\ndeclare the value of missing heights, such as: gdal_edit.py -a_nodata -9999"
         )
+    # Row and column of the nearest known cell.
     nearest = distance_transform_edt(~is_known, return_distances=False, return_indices=True)
     return heights[tuple(nearest)], is_known
 
@@ -115,7 +124,7 @@ def _open(rasterio: ModuleType, file: str | Path) -> Any:
 
 
 def _systems(raster: Any, frame: Frame | None) -> tuple[Any, Any, Float[ndarray, "2"]]:
-    """Coordinate systems of a file and of the world frame, and the world's origin there."""
+    """Coordinate systems of a file and of the world frame, and the world's origin in the latter."""
     if frame is not None:
         target = f"EPSG:{frame.epsg}"
         return raster.crs or target, target, np.array([frame.x, frame.y])

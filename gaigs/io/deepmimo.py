@@ -18,7 +18,7 @@ class Station(NamedTuple):
     position: Float[np.ndarray, "3"]  # place of the station [m]
     # Gain of each path at the carrier, with the phase of its length; 0 for no path.
     fields: Complex[np.ndarray, "n p"]
-    # Points of its reflections from the station on [m]; NaN for missing ones.
+    # Points of up to k reflections in order from the station [m]; NaN for missing points.
     bounces: Float[np.ndarray, "n p k 3"]
 
 

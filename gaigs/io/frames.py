@@ -54,9 +54,9 @@ def read_frame(frame: Any, name: str = "data frame") -> Table:
 
 
 def _read_columns(frame: Any, name: str) -> tuple[list[str], list[ndarray]]:
-    """Names of a frame's columns, and the columns; no columns if two have one name."""
+    """Names of a frame's columns, and the columns; an empty list if two have the same name."""
     if not isinstance(frame, Mapping) and not hasattr(frame, "column_names"):
-        # pandas: a pivoted table has its places in the index.
+        # In pandas a pivoted table has its places in the index, which becomes columns again.
         index = getattr(getattr(frame, "index", None), "names", [])
         levels = [level for level in index if level is not None and level not in frame.columns]
         frame = frame.reset_index(level=levels) if levels else frame

@@ -100,7 +100,7 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
 
 
 def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
-    """Numbers and texts of lines; a line that ends in a backslash is joined with the next one.
+    """Number and text of each line; a line that ends in a backslash is joined with the next one.
 
     A joined line has the number of its last part, counted from 1.
     """
@@ -137,7 +137,7 @@ def _face(words: Sequence[str], count: int) -> Face:
         numbers = [int(word.split("/")[0]) for word in words]
     except ValueError:
         raise ValueError("numbers of vertices") from None
-    # They count from 1, or back from the last vertex so far.
+    # Vertices count from 1, or with negative numbers back from the last vertex so far.
     face = tuple(k - 1 if k > 0 else count + k for k in numbers)
     if len(face) < 3 or 0 in numbers or not all(0 <= corner < count for corner in face):
         raise ValueError(f"a face of three vertices or more of the {count} before it")

@@ -185,8 +185,9 @@ def split_rows(
 
 def miscounted(line: str, cells: Sequence[str], count: int) -> str:
     """End of a message for a line without ``count`` cells: their number, the line, the reason."""
-    others = [word for mark, word in SEPARATORS.items() if len(split_cells(line, mark)) == count]
-    reason = f"; columns separated by {others[0]}?" if others else ""
+    # Separators that would give the right number of cells.
+    fitting = [word for mark, word in SEPARATORS.items() if len(split_cells(line, mark)) == count]
+    reason = f"; columns separated by {fitting[0]}?" if fitting else ""
     if len(cells) > count and all(re.fullmatch(r"[+-]?\d+", cell) for cell in cells):
         reason = "; decimal commas? write points, or semicolons between columns"
     return f"{len(cells)}: {quote(line)}{reason}"
@@ -243,7 +244,7 @@ class Table(NamedTuple):
 
 
 def write_table(file: Path, rows: Iterable[Sequence]) -> None:
-    """Writes rows as a CSV table, the heading first; texts after ``inert``."""
+    """Writes rows as a CSV table, the heading first; ``inert`` changes texts for spreadsheets."""
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
         for row in rows:
@@ -253,15 +254,15 @@ def write_table(file: Path, rows: Iterable[Sequence]) -> None:
 def inert(text: str) -> str:
     """A text that no spreadsheet reads as a formula.
 
-    A text that starts with =, +, -, @, a tab or a return gets an apostrophe in front, even if it
-    already has some. Numbers are unchanged.
+    A text that starts with =, +, -, @, a tab or a return gets an apostrophe in front. Apostrophes
+    that it already has are skipped in this test, so ``original`` is unique. Numbers are unchanged.
     """
     starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
 
 
 def original(text: str) -> str:
-    """The inverse of ``inert``: the text before an apostrophe was added."""
+    """The text to which ``inert`` added an apostrophe; other texts are unchanged."""
     return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 
@@ -341,7 +342,10 @@ def to_number(cell: str) -> float:
 
 
 def to_index(text: str) -> int | None:
-    """A whole number from 0 in decimal digits; None for any other text."""
+    """A whole number from 0 in decimal digits; None for any other text.
+
+    A number of 19 digits or more becomes the largest index, which no list has.
+    """
     if not (text.isascii() and text.isdecimal()):
         return None
     digits = text.lstrip("0")

@@ -145,7 +145,7 @@ class Registry:
             check_known(f"{self.kind} {name!r}", self.get(name), sorted(options), given)
 
     def choices(self, name: str) -> dict[str, str]:
-        """Task and split in a data reader's registration, without an import."""
+        """Task and split that a data reader's registration chooses, without an import."""
         if name in self._choices:
             return self._choices[name]
         holders, _ = find_holders(self.kind, name)

@@ -12,6 +12,10 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
 
     Args:
         owner: Name of the function in errors.
+
+    Raises:
+        TypeError: The options are no mapping, or an option has a wrong type.
+        ValueError: An option is unknown or missing, or the call fails with an unclear error.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{owner} must be a mapping of options, got {options!r}")
@@ -31,7 +35,7 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
     try:
         return function(**arguments)
     except (Exception, SystemExit) as error:
-        if _names_its_option(error, function):
+        if _is_clear(error, function):
             raise
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         advice = f"check its options: {_suspects(str(error), options)}"
@@ -75,8 +79,11 @@ def _signature(function: Callable) -> inspect.Signature:
         return inspect.signature(function)
 
 
-def _names_its_option(error: BaseException, function: Callable) -> bool:
-    """True for an error of gaigs or of a plug-in, whose message names the option."""
+def _is_clear(error: BaseException, function: Callable) -> bool:
+    """True if an error needs no advice on options.
+
+    Messages of gaigs and of plug-ins name the option; messages of torch and Lightning do not.
+    """
     if isinstance(error, ArithmeticError | MemoryError | SystemExit):
         return False
     if "tried to allocate" in str(error):  # torch's words where memory is short

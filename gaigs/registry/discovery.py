@@ -158,7 +158,7 @@ def _built_in_holders(kind: str) -> list[Holder]:
 
 def _installed_holders(kind: str) -> list[Holder]:
     """Holders of a kind by the entry points of installed packages."""
-    # The key of the cache: an installation changes a folder of sys.path.
+    # The key of the cache of entry points: an installation changes a folder of sys.path.
     path = tuple(
         (folder, os.stat(folder or ".").st_mtime_ns)
         for folder in sys.path
@@ -248,7 +248,7 @@ def _with_imports(place: Path) -> set[Path]:
         files = {place} if place.is_file() else {*place.rglob("*.py")}
         for file in files - known:
             text = file.read_text(errors="replace")
-            # Words of import statements: too many are harmless, as only existing files count.
+            # All words of import statements. Too many are harmless, as only existing files count.
             words: set[str] = set()
             for line in re.findall(r"^\s*(?:from|import)\s(.*)", text, re.M):
                 words |= {*re.findall(r"(?:plugins\.)?(\w+)", line)}

@@ -63,7 +63,7 @@ def _allowed(value: Any, annotation: Any) -> list[Any]:
 
 
 def _bare(annotation: Any) -> Any:
-    """An annotation without its arguments."""
+    """An annotation without its arguments, such as ``list`` for ``list[int]``."""
     return typing.get_origin(annotation) or annotation
 
 

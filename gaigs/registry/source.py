@@ -81,6 +81,7 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
         argument.arg: default
         for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
     }
+    # A constructor's first parameter is the object itself.
     itself = names[:1] if isinstance(located.node, ast.ClassDef) else []
     no_options = {*itself, *given, *(argument.arg for argument in arguments.posonlyargs)}
     return {
@@ -104,6 +105,7 @@ def registering_statement(component: Callable) -> str:
         statements = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt)]
     except SyntaxError:  # the file has been edited meanwhile
         return ""
+    # The innermost statement around this line starts last.
     around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or 0)]
     innermost = [max(around, key=_first_line)] if around else []
     # A call register(...)(Name) is separate from the definition of Name.
@@ -178,7 +180,10 @@ def _definition(file: Path, name: str) -> Located:
 
 
 def _module_file(importer: Path, module: str, level: int) -> Path:
-    """The file of a module of gaigs, or of the package of the file that imports it."""
+    """The file of an imported module; an error unless it is of gaigs or the importer's package.
+
+    ``level`` is the number of leading dots of a relative import.
+    """
     words = module.split(".") if module else []
     if level:
         folder = importer.parents[level - 1]
@@ -193,7 +198,7 @@ def _module_file(importer: Path, module: str, level: int) -> Path:
 
 
 def _value(default: Located) -> object:
-    """The value of a default: a literal, or the name of one."""
+    """The value of a default, which is a literal or the name of a literal in its file."""
     file, node = default
     try:
         return ast.literal_eval(node)  # type: ignore[arg-type]

@@ -77,7 +77,10 @@ def _own_options(estimator: Any) -> dict:
 
 
 def note_arguments(kind: str, name: str, component: Any) -> Any:
-    """Makes instances of a class record their arguments as ``configuration``."""
+    """Replaces a class's constructor by one that records its arguments as ``configuration``.
+
+    Functions, and classes that already do so, are unchanged.
+    """
     make: Any = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component
@@ -91,7 +94,7 @@ def note_arguments(kind: str, name: str, component: Any) -> Any:
     @functools.wraps(make)
     def noting(self, *args, **kwargs) -> None:
         with usual_modes():
-            make(self, *args, **kwargs)
+            make(self, *args, **kwargs)  # the class's own constructor
         if type(self) is component:  # a subclass has a name of its own, or none
             bound = signature.bind(self, *args, **kwargs)
             bound.apply_defaults()

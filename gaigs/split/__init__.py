@@ -26,11 +26,11 @@ def places_of(links: Links) -> Int[Tensor, " n"]:
     """
     rows = rows_of(links)
     last = rows.new_full((len(rows),), int(rows.max()))
-    # First joins the rows of a place, then the places of a row.
+    # Each link gets the lowest row at its place, and then the lowest of these rows in its own row.
     for numbers in (links.query.place_keys, rows):
-        _, which = numbers.unique(return_inverse=True)  # (n,)
-        first = last.scatter_reduce(0, which, rows, "amin")
-        rows = first[which]
+        _, set_of = numbers.unique(return_inverse=True)  # links of one place or row, (n,)
+        first = last.scatter_reduce(0, set_of, rows, "amin")
+        rows = first[set_of]
     return rows
 
 
@@ -46,7 +46,7 @@ def part(
 ) -> Split:
     """Holds out whole groups of links, first for the test, then in the same way for validation.
 
-    Of links at a single place, such as readings at a new receiver, none are held out.
+    If all links are at a single place, such as readings at a new receiver, none are held out.
 
     Args:
         name: Name of the split with its specific options; the common options are appended.
@@ -104,7 +104,7 @@ def drawn(
 
 
 class Parted(NamedTuple):
-    """Kept links and held-out links, both ascending."""
+    """Numbers of kept links and of held-out links, both ascending."""
 
     kept: Int[Tensor, " k"]
     held: Int[Tensor, " h"]
@@ -144,17 +144,19 @@ def hold_out(
             f"of them or more, got {len(order)} with {len(links)} links; choose smaller runs or "
             f"cubes, add measurements{without}"
         )
+    # Groups numbered from 0: those of the random order, then those of the links.
     _, numbers = torch.cat((order, groups[links])).unique(return_inverse=True)
-    of_order, of_links = numbers.tensor_split([len(order)])
-    sizes = votes.new_zeros(len(order)).index_add(0, of_links, votes[links])
-    # Votes in the first 1, 2, ... groups. Sums of thirds are whole numbers in single precision.
-    filled = sizes[of_order].cumsum(0).float()
+    ordered, of_links = numbers.tensor_split([len(order)])
+    weights = votes.new_zeros(len(order)).index_add(0, of_links, votes[links])
+    # Weight of the first 1, 2, ... groups. Single precision rounds sums of thirds to whole numbers.
+    filled = weights[ordered].cumsum(0).float()
     total = filled[-1].item()
     filled = filled[:-1]  # one group at least is kept
     surplus = filled - usual * total
     count = int(surplus.abs().argmin()) + 1
     if at_most:
         count = max(1, int((surplus <= 0).sum()))
+    # Nine links are sought, up to 0.3 of the weight.
     if fraction is None and filled[count - 1] < 9:
         enough = int((filled < 9).sum())
         if enough < len(filled) and filled[enough] <= 0.3 * total:

@@ -29,10 +29,13 @@ def official(
     generator = generator_of(seed)
     train, test = (part.sort().values for part in links.official())
     rows = rows_of(links)
-    usual = 0.1 if validation is None else validation
-    length = min(length, max(1, int(usual * len(rows[train].unique()) / 4)))
+    # Four runs or more validate.
+    fraction = 0.1 if validation is None else validation
+    validating_rows = fraction * len(rows[train].unique())
+    length = min(length, max(1, int(validating_rows / 4)))
     has_runs = length > 1
     groups = runs_of(links, length) if has_runs else places_of(links)
+    # Runs are large, so the nearest number of runs could be far above the fraction.
     drawn_by = {"at_most": True} if has_runs else {"rows": rows}
     train, validating, share = hold_out(
         "validation", train, groups, links.query.votes, validation, generator, **drawn_by

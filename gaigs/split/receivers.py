@@ -42,7 +42,8 @@ def receivers(
     check("test", test, 0 < test < 1, "in (0, 1)")
     generator = generator_of(seed)
     order = torch.randperm(len(links.receivers), generator=generator)
-    if links.uncertainties is not None:  # a receiver without a place is located by its links
+    # A place that is estimated would come from the links that are predicted.
+    if links.uncertainties is not None:
         order = order[links.uncertainties[order].isfinite()]
     held, name = _held(links, order, hold, test, fold)
     if not torch.isin(held, order).all() or not len(held):
@@ -51,19 +52,19 @@ def receivers(
             f"{len(order)}; give others by data.gateways, or take split=random"
         )
     of_links = links.query.receivers  # receiver of each link
-    rest = of_links[~torch.isin(of_links, held)].unique()
-    if len(rest) < 2:
+    remaining = of_links[~torch.isin(of_links, held)].unique()
+    if len(remaining) < 2:
         raise ValueError(
-            f"split=receivers leaves two receivers or more to train on, got {len(rest)} of "
+            f"split=receivers leaves two receivers or more to train on, got {len(remaining)} of "
             f"{len(links.receivers)}; hold fewer, or take split=random"
         )
-    order = order[torch.isin(order, rest)]
+    order = order[torch.isin(order, remaining)]
     is_test = torch.isin(of_links, held)
     training = (~is_test).nonzero()[:, 0]
-    if len(rest) > 2 and validation != 0:
+    if len(remaining) > 2 and validation != 0:
         share = 0.2 if validation is None else validation
-        # Two receivers or more train.
-        count = min(max(1, round(share * len(order))), len(rest) - 2)
+        # Two receivers or more must be left to train on.
+        count = min(max(1, round(share * len(order))), len(remaining) - 2)
         validating = order[:count]
         is_validating = torch.isin(of_links[training], validating)
         train, validated = training[~is_validating], training[is_validating]

@@ -33,7 +33,7 @@ from gaigs.data.checks.waves import (
 class Measure(NamedTuple):
     """A measure of how well geometry explains channels."""
 
-    measure: Callable[[Sample], float]  # share of a sample that geometry explains, 0 to 1
+    measure: Callable[[Sample], float]  # gives the share of a sample that geometry explains
     least: float  # smallest fraction that identifies a convention
     enough: float  # share above which the data need no other convention
     sentence: str  # sentence for users, with {} for the share
@@ -44,15 +44,18 @@ def check_channels(links: Any) -> Iterator[Finding]:
     """Findings about complex channels."""
     yield from check_constant_subcarriers(links)
     known = torch.arange(len(links)) if links.split is None else links.split.train
-    every = links.query.receivers[known]
-    parts = [evenly(known[every == receiver], 64) for receiver in range(len(links.receivers))]
-    train = torch.cat(parts)
+    receiver_of = links.query.receivers[known]
+    chosen = []
+    for receiver in range(len(links.receivers)):  # at most 64 links each
+        chosen.append(evenly(known[receiver_of == receiver], 64))
+    train = torch.cat(chosen)
     sample = sample_at(links, train)
     yield from check_powers(sample)
     yield from check_signs(sample)
     order = order_of_subcarriers(sample)
     if links.front_ends is not None:
-        # Phases that a front end explains are no fault of the geometry; powers are as measured.
+        # Phases that a front end explains are no fault of the geometry. The checks above are of the
+        # channels as measured.
         responses = links.front_ends.responses[sample.receivers].to(sample.labels)
         sample = replace(sample, labels=sample.labels / responses)
     yield from [order] if order is not None else check_phases(links, train, sample)
@@ -76,6 +79,9 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
     """Findings if phases of channels do not follow the geometry, or contradict ``data.phase``.
 
+    The first convincing explanation counts: another convention, fixed phases of elements or
+    subcarriers, a random phase of each link, no geometry at all.
+
     Args:
         train: Numbers of the sample's links in ``links``.
         sample: The links with these numbers.
@@ -85,8 +91,9 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     is_known = task.phase == "known"
     has_gain = task.phase != "per_link_and_delay"
     receivers, labels = sample.receivers, sample.labels
-    everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
-    waves = direct_waves(everywhere, links.query[train], task.frequencies)
+    # Direct waves need receivers and task of a scene, and not its extent.
+    scene = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
+    waves = direct_waves(scene, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0  # 0 if neither sign fits
     # Another convention may explain phases over all links, or else the phases within each link.
     explained = "the direct wave explains {} of the channels"
@@ -169,8 +176,11 @@ def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
     """A finding about the conventions by which geometry explains channels clearly better.
 
-    Conventions that explain the channels equally well are named together. ``score`` has the bounds
-    above which an improvement is clear.
+    Conventions that explain the channels equally well are named together. None if no convention is
+    clearly better.
+
+    Args:
+        score: Measure of the explained share, with the bounds above which an improvement is clear.
     """
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:
@@ -181,17 +191,20 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     for convention in conventions(few, score.measure):
         changed = convention.change(few)
         share = score.measure(changed)
-        # Channels that are similar at all links fit any convention under which distances hardly
-        # differ.
         is_telling = share > max(read, score.least / 2) and has_extent(changed)
+        # Channels that are similar at all links fit any convention under which distances hardly
+        # differ. So the distances must explain more than equal distances do.
         if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:
             tried.append((share, convention))
     if not tried:
         return None
-    likely = sorted((share for share, _ in tried), reverse=True)[:8]
-    kept = [convention for share, convention in tried if share >= likely[-1]]
-    fitting = [(score.measure(convention.change(sample)), convention) for convention in kept]
+    eight_best = sorted((share for share, _ in tried), reverse=True)[:8]
+    fitting = []
+    for share, convention in tried:
+        if share >= eight_best[-1]:
+            fitting.append((score.measure(convention.change(sample)), convention))
     fits = max(share for share, _ in fitting)
+    # Clearly more is explained, or the unexplained part is halved.
     is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
     if fits < score.least or not is_better:
         return None

@@ -51,14 +51,17 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
         yield changing(
             f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend
         )
-    is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s), the phase of all links
+    # Elements and subcarriers whose phase is equal at all links: |mean phasor| is 1.
+    is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s)
+    # Phases were stored relative to the first subcarrier.
     is_relative = is_constant[:, 0].any() and not is_constant[:, -1].any()
     if is_relative or is_constant.all():
-        return  # phases were taken off, or never stored
+        return  # the carrier's phase was never stored
     name = "the carrier's phase over the delay is missing"
     mend = "multiply each path by np.exp(-2j * np.pi * carrier * tau) before the sum"
-    # The distance counts from the array's middle, or of several elements from each of them.
-    for at_elements in (False, True)[: sample.labels.shape[1]]:
+    # Distances count from the array's middle, or from each of several elements.
+    has_several = sample.labels.shape[1] > 1
+    for at_elements in (False, True) if has_several else (False,):
         yield Hypothesis(name, partial(_with_carrier, at_elements=at_elements), mend)
 
 
@@ -111,10 +114,15 @@ def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
-    """Axes that are exchanged or point the other way."""
+    """Conventions with axes that are exchanged or point the other way.
+
+    Args:
+        ends: Groups of point names (``tx``, ``rx``, ``elements``) that are changed together.
+    """
     exchanged = {"x and y": [1, 0, 2], "y and z": [0, 2, 1], "x and z": [2, 1, 0]}
     points = torch.cat((sample.transmitters, sample.positions))
-    # A wall or floor in a plane of the axes reflects as if that axis were negated.
+    # If all points are on one side of a plane of the axes, there may be a wall in this plane. It
+    # reflects as if the axis were negated, so the check of signs would be ambiguous.
     has_wall = (points >= 0).all(0) | (points <= 0).all(0)
     for subjects in ends:
         text = " and ".join(subjects)
@@ -152,7 +160,11 @@ def of_angles() -> Iterator[Hypothesis]:
 
 
 def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
-    """Places and elements in other units than metres; km is the rarest."""
+    """Conventions with places and elements in other units than metres; km is the rarest.
+
+    Args:
+        ends: Groups of point names (``tx``, ``rx``, ``elements``) that are changed together.
+    """
     units = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}
     for unit, factor in units.items():
         for subjects in sorted(ends, key=len, reverse=True):
@@ -160,12 +172,12 @@ def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
 
 
 def of_frames() -> Iterator[Hypothesis]:
-    """Transmitters whose origin is their receiver."""
+    """Convention under which each transmitter is given relative to its receiver."""
     yield Hypothesis("tx are relative to rx", _from_receivers, "tx = tx + rx")
 
 
 def of_plans(sample: Sample) -> Iterator[Hypothesis]:
-    """Receivers whose coordinates count from another corner or point of the floor plan."""
+    """Conventions with receivers counted from another corner or point of the floor plan."""
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     for name, axes in {"x": [0], "y": [1], "x and y": [0, 1]}.items():
         move = partial(_mirrored, ends=low + high, axes=axes)
@@ -181,7 +193,7 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
         ("lowest corner", low, "tx.min(0)"),
         ("middle", (low + high) / 2, "(tx.min(0) + tx.max(0)) / 2"),
     ):
-        shift = point * point.new_tensor([1, 1, 0])
+        shift = point * point.new_tensor([1, 1, 0])  # heights stay
         yield changing(
             f"the origin of rx is the {name} of tx",
             ["positions"],
@@ -191,12 +203,17 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """The order of receivers that fits best; with many receivers only shifts by one are tried."""
+    """Conventions with the receivers in another order.
+
+    Orders are shifts by one and, for 3 to 8 receivers, the order with the best ``measure``.
+    """
     count = len(sample.positions)
     read = torch.arange(count)
+    # Two receivers have a single shift, and one receiver has none.
     orders = [read.roll(1), read.roll(-1)][: count - 1]
     if 2 < count <= 8:
-        fits = torch.zeros(count, count)  # links of one receiver at the place of another
+        # Measure of each receiver's links if it stood at each place (receiver, place).
+        fits = torch.zeros(count, count)
         for receiver in sample.receivers.unique().tolist():
             links = sample.at((sample.receivers == receiver).nonzero()[:, 0])
             for place in range(count):
@@ -215,9 +232,12 @@ def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothes
 
 
 def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
-    """The convention that points of ``ends`` need multiplication by a matrix.
+    """The convention under which stored points have to be multiplied by a matrix.
 
-    ``mend`` is this multiplication as text in numpy, which the advice appends to array names.
+    Args:
+        ends: Names of the points: ``tx``, ``rx`` or ``elements``.
+        mend: The same multiplication in numpy, which the advice appends to each of these names.
+        matrix: Matrix (3, 3), multiplied from the right.
     """
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
@@ -227,8 +247,10 @@ def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hy
 
 
 def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
-    """The convention that points of ``ends`` are in a unit of ``factor`` metres."""
-    subject = ", ".join(ends[:-1]) + " and " * (len(ends) > 1) + ends[-1]
+    """The convention under which points of ``ends`` are in a unit of ``factor`` metres."""
+    subject = ends[-1]
+    if len(ends) > 1:
+        subject = f"{', '.join(ends[:-1])} and {subject}"
     return _everywhere(ends, f"{subject} are in {unit}", f" * {factor:.4g}", factor * torch.eye(3))
 
 
@@ -262,7 +284,7 @@ def _mirrored(
 
 
 def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, "n e s"]:
-    """Channels whose elements are read by columns of a planar array, instead of by rows."""
+    """Channels with elements sorted by columns of a planar array, instead of by ``rows`` rows."""
     planar = labels.unflatten(1, (rows, -1))  # (n, rows, columns, s)
     return planar.transpose(1, 2).flatten(1, 2)
 
@@ -275,24 +297,28 @@ def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"
 
 
 def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Points whose angle from the z axis becomes their elevation."""
+    """Points with pi / 2 - elevation in place of the elevation; azimuth and distance stay."""
     azimuths, elevations, distances = to_spherical(points)
     return distances[:, None] * from_spherical(azimuths, math.pi / 2 - elevations)
 
 
 def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Points whose azimuth and elevation are multiplied by 180 / pi."""
+    """Points with azimuth and elevation multiplied by 180 / pi; the distance stays."""
     azimuths, elevations, distances = to_spherical(points)
-    return distances[:, None] * from_spherical(
-        math.degrees(1) * azimuths, math.degrees(1) * elevations
-    )
+    factor = math.degrees(1)
+    return distances[:, None] * from_spherical(factor * azimuths, factor * elevations)
 
 
 def _with_carrier(sample: Sample, at_elements: bool) -> Sample:
-    """Channels times the direct wave's phase at the middle of the band."""
+    """Channels times the direct wave's phase factor at the middle of the band.
+
+    Args:
+        at_elements: True to take the distance to each element, false to the array's middle.
+    """
     distances = direct_distances(sample)
     if not at_elements:
         distances = distances.mean(1, keepdim=True)
-    phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances  # (n, e)
-    turns = torch.polar(torch.ones_like(phases), phases)[..., None]
-    return replace(sample, labels=sample.labels * turns)
+    wavenumber = -2 * math.pi * sample.frequencies.mean() / speed_of_light
+    phases = wavenumber * distances  # (n, e)
+    phasors = torch.polar(torch.ones_like(phases), phases)
+    return replace(sample, labels=sample.labels * phasors[..., None])

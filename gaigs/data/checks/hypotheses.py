@@ -32,7 +32,7 @@ class Sample:
         return torch.einsum("nw,nwa->na", offsets, self.rotations[self.receivers])
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
-        """The links of the sample with these numbers."""
+        """The sample's links at these positions in the sample."""
         return replace(
             self,
             index=self.index[index],

@@ -105,12 +105,12 @@ def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
 def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     """A finding about positive levels that seem to have lost their sign."""
     positive = levels > 0
-    usual = levels[~positive]
     if not positive.any():
         return
-    low, high = np.quantile(usual.numpy(), (0.01, 0.99)).tolist()
-    # The negative is within the usual range, and the level itself is far above it.
-    lost = positive & (-levels >= low - 10) & (-levels <= high + 10) & (levels > high + 30)
+    low, high = np.quantile(levels[~positive].numpy(), (0.01, 0.99)).tolist()
+    # With the other sign the level is usual, to 10 dB. As given, it is far above usual levels.
+    is_usual_negated = (-levels >= low - 10) & (-levels <= high + 10)
+    lost = positive & is_usual_negated & (levels > high + 30)
     if lost.any():
         text = f"{int(lost.sum())} levels are above 0 dBm, and usual with the other sign"
         yield Finding("sign of levels", text, "was a sign lost? levels = -np.abs(levels)")
@@ -119,19 +119,19 @@ def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     """Findings about receivers with a constant level, or with the levels of another receiver."""
     names = [receiver.name for receiver in links.receivers]
-    _, place = links.query.place_keys.unique(return_inverse=True)
+    _, place = links.query.place_keys.unique(return_inverse=True)  # (n,)
     count = int(place.max()) + 1
     constant: list[str] = []
     equal: list[str] = []
-    first: dict[bytes, int] = {}
+    first_with: dict[bytes, int] = {}  # number of the first receiver with a column of levels
     for number in range(len(names)):
         at_receiver = links.query.receivers == number
         if at_receiver.sum() >= 5 and levels[at_receiver].unique().numel() == 1:
             constant.append(names[number])
             continue
-        column = np.full(count, np.nan)
+        column = np.full(count, np.nan)  # level at each place
         column[place[at_receiver].numpy()] = levels[at_receiver].numpy()
-        other = first.setdefault(column.tobytes(), number)
+        other = first_with.setdefault(column.tobytes(), number)
         if other != number and at_receiver.sum() >= 3:
             equal.append(f"{names[other]} and {names[number]} have the same levels")
     if constant:
@@ -141,9 +141,13 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
-    """Findings about levels that differ from nearby levels, and about a wrong order of rows."""
-    sample = sample_of(replace(links, split=None), most)
-    excess = above_neighbours(sample)
+    """Findings about levels that differ from nearby levels, and about a wrong order of rows.
+
+    At most ``most`` links are checked, and the ``shown`` worst ones are listed.
+    """
+    sample = sample_of(replace(links, split=None), most)  # also of test links
+    excess = above_neighbours(sample)  # (n,)
+    # Without a given place of the receiver there is no distance, and neighbours alone decide.
     is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
     if links.uncertainties is not None:
         is_placed = links.uncertainties == 0
@@ -154,23 +158,24 @@ def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterato
     is_alike = excess * errors > 0
     outlying = torch.where(is_alike, torch.minimum(excess.abs(), errors.abs()), 0.0)  # (n,)
     scales = torch.stack([_scale(excess, sample), _scale(errors, sample)]).amax(0)  # (r,)
-    wrong = (outlying > (6 * scales[sample.receivers]).clamp_min(50)).nonzero()[:, 0]
+    bounds = (6 * scales[sample.receivers]).clamp_min(50)  # six deviations, 50 dB or more
+    wrong = (outlying > bounds).nonzero()[:, 0]
     if not len(wrong):
         yield from check_places_of_levels(sample, excess, is_placed)
         return
-    named = []
-    for number in wrong[outlying[wrong].argsort(descending=True)][:shown].tolist():
+    sentences = []
+    largest_first = outlying[wrong].argsort(descending=True)
+    for number in wrong[largest_first][:shown].tolist():
         row = "" if links.rows is None else f"row {int(links.rows[sample.index[number]])} "
-        at = ", ".join(f"{x:.4g}" for x in sample.transmitters[number].tolist())
+        place = ", ".join(f"{x:.4g}" for x in sample.transmitters[number].tolist())
         level = sample.labels[number].item()
         usual = level - excess[number].item()
         name = links.receivers[int(sample.receivers[number])].name
-        named.append(f"{row}({at}) at {name}: {level:.3g} dBm, its neighbours {usual:.3g} dBm")
+        levels = f"{level:.3g} dBm, its neighbours {usual:.3g} dBm"
+        sentences.append(f"{row}({place}) at {name}: {levels}")
     more = f" and {len(wrong) - shown} more" if len(wrong) > shown else ""
-    mend = "correct them, or leave them out as nan"
-    yield Finding(
-        "single levels", f"levels are far from those of near places: {', '.join(named)}{more}", mend
-    )
+    text = f"levels are far from those of near places: {', '.join(sentences)}{more}"
+    yield Finding("single levels", text, "correct them, or leave them out as nan")
 
 
 def above_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
@@ -187,9 +192,8 @@ def above_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]
         places = sample.transmitters[links].numpy()
         _, near = cKDTree(places).query(places, k=min(neighbours + 1, len(links)))
         levels = sample.labels[links]
-        # The nearest link is the link itself.
-        neighbouring = levels[torch.from_numpy(near[:, 1:])]  # (k, neighbours)
-        excess[links] = levels - neighbouring.median(1).values
+        neighbours_of = torch.from_numpy(near[:, 1:])  # the nearest link is the link itself
+        excess[links] = levels - levels[neighbours_of].median(1).values
     return excess
 
 
@@ -203,17 +207,17 @@ def check_places_of_levels(
         excess: Differences of levels from their neighbours [dB], from ``above_neighbours``.
         is_placed: True for receivers at given places; links of other receivers do not count.
     """
-    counts = is_placed[sample.receivers] & (excess != 0)
-    # A law of equal distances leaves levels less their receiver's mean.
-    constant = torch.zeros_like(excess)
-    flat = fit_law(constant, sample).errors[counts]
-    if not counts.any() or excess[counts].abs().mean() < 0.95 * flat.abs().mean():
+    is_used = is_placed[sample.receivers] & (excess != 0)
+    # With equal distances the law is the receiver's mean, and errors are levels less this mean.
+    equal = torch.zeros_like(excess)
+    levels = fit_law(equal, sample).errors[is_used]
+    if not is_used.any() or excess[is_used].abs().mean() < 0.95 * levels.abs().mean():
         return
     # The regression of levels on logarithms of distances, both less their receiver's mean.
-    logarithms = fit_law(constant, replace(sample, labels=decades(sample))).errors[counts]
+    logarithms = fit_law(equal, replace(sample, labels=decades(sample))).errors[is_used]
     squares = logarithms.square().sum()
-    slope = (logarithms @ flat / squares).item()
-    deviation = (flat.square().mean() / squares).sqrt().item()
+    slope = (logarithms @ levels / squares).item()
+    deviation = (levels.square().mean() / squares).sqrt().item()
     if slope - 3 * deviation > -12:  # free space has -20
         text = (
             f"levels change by {slope:.2g} +- {deviation:.2g} dB a decade of distance, and near "
@@ -227,6 +231,7 @@ def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
 
     A receiver with under 10 links gets the deviation over all receivers.
     """
+    # 1.4826 medians of normal absolute errors are a standard deviation.
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
         at_receiver = errors[sample.receivers == number]

@@ -27,8 +27,8 @@ def check_places(links: Any) -> Iterator[Finding]:
     sites = sites_of(links.query)
     measured = _measured(links)
     tree = cKDTree(_positions(links)[measured].double().numpy())
-    near = tree.query(sites.double().numpy())[0] < 0.01
-    # One may be measured beside a receiver; radios that move meet at the same places.
+    near = tree.query(sites.double().numpy())[0] < 0.01  # transmitters within 1 cm
+    # A single place may be beside a receiver, and moving radios meet at the same places.
     if len(sites) > 1 and near.sum() > 1 and not links.one_radio:
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
@@ -51,6 +51,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
     span = extent.max().item()
     across = extent[:2].max().item()
     x, y = sites[:, :2].mean(0).tolist()
+    # Longitude and latitude are far from 0 in comparison with the extent of a site.
     is_global = abs(x) <= 180 and abs(y) <= 90 and math.hypot(x, y) > 30 * across > 0
     if links.frame is None and is_global and across < 0.3:
         text = f"x and y of places span {across:.2g} m around ({x:.7g}, {y:.7g})"
@@ -80,16 +81,16 @@ def scale_of(places: Float[Tensor, "n 3"]) -> str:
         if 0 <= low - lower <= margin and 0 <= upper - high <= margin:
             return f"scaled to {lower:g}..{upper:g} along each axis"
     # Standardised coordinates have deviation 1 and mean 0.
-    off_deviation = (places.std(0, correction=0) - 1).abs().max()
-    off_mean = places.mean(0).abs().max()
-    return "standardised along each axis" if max(off_deviation, off_mean) < 0.1 else ""
+    deviation_error = (places.std(0, correction=0) - 1).abs().max()
+    mean_error = places.mean(0).abs().max()
+    return "standardised along each axis" if max(deviation_error, mean_error) < 0.1 else ""
 
 
 def sites_of(query: Query) -> Float[Tensor, "k 3"]:
-    """The distinct places of transmitters."""
-    _, which = query.place_keys.unique(return_inverse=True)
-    sites = query.transmitters.new_zeros((int(which.max()) + 1, 3))
-    sites[which] = query.transmitters
+    """The distinct places of transmitters [m]."""
+    _, numbers = query.place_keys.unique(return_inverse=True)  # (n,)
+    sites = query.transmitters.new_zeros((int(numbers.max()) + 1, 3))
+    sites[numbers] = query.transmitters
     return sites
 
 
@@ -103,7 +104,7 @@ def check_arrays(links: Any) -> Iterator[Finding]:
     for receiver in links.receivers:
         elements = receiver.array.elements
         extent = _diagonal(elements)
-        aside = elements.mean(0).norm().item()
+        aside = elements.mean(0).norm().item()  # from the receiver's position [m]
         if extent > room > 0:
             yield Finding(
                 "unit of elements",
@@ -126,6 +127,7 @@ def check_arrays(links: Any) -> Iterator[Finding]:
                     f"{apart / wavelength:.3g} wavelengths",
                     "are they in m?",
                 )
+    # Half of the last digit of float32 at the largest coordinate [m].
     rounding = places.abs().max().item() * torch.finfo(torch.float32).eps / 2
     if links.task.dtype.is_complex and rounding > wavelength / 300 > 0:
         yield Finding(
@@ -137,7 +139,12 @@ def check_arrays(links: Any) -> Iterator[Finding]:
 
 
 def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
-    """A finding if walls, from above, are in another unit or area than the places."""
+    """A finding if walls are in another unit or area than the places, in the floor plan.
+
+    Args:
+        walls: Points of the walls [m].
+        places: Transmitters and receivers [m].
+    """
     across = _diagonal(walls[:, :2])
     room = _diagonal(places[:, :2])
     if across and room and not 1 / 50 < across / room < 50:  # millimetres differ by 1000
@@ -145,6 +152,7 @@ def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> It
         yield Finding("unit of walls", text, "are both in m?")
         return
     lower, upper = walls[:, :2].amin(0), walls[:, :2].amax(0)
+    # Gap between the two boxes along x and y; negative where they overlap.
     gaps = torch.maximum(lower - places[:, :2].amax(0), places[:, :2].amin(0) - upper)  # (2,)
     apart = gaps.clamp_min(0).norm().item()
     if apart > 0.1 * (across + room):  # a single wall may also be some distance away

@@ -21,8 +21,8 @@ from gaigs.io.tables import shortened
 def check_receivers(links: Any) -> Iterator[Finding]:
     """Findings about places of receivers that contradict the levels.
 
-    Possible faults are tried in this order, and the first one that explains the levels counts:
-    another convention or order, another origin, single receivers at wrong places.
+    Possible faults are tried in this order: another convention or order, another origin, single
+    receivers at wrong places. Only the first fault that explains the levels is reported.
     """
     placed = sample_of_given(links)
     if placed is None:
@@ -47,9 +47,9 @@ def check_power(links: Any) -> Iterator[Finding]:
     carriers = links.query.frequencies
     carrier = None if carriers is None else carriers.median().item()
 
-    def powers(supposed: float) -> Float[Tensor, " n"]:
-        """Transmit powers in free space [dBm], at the carrier or a supposed one [Hz]."""
-        wavelength = speed_of_light / (carrier or supposed)
+    def powers(otherwise: float) -> Float[Tensor, " n"]:
+        """Transmit powers in free space [dBm]; ``otherwise`` is in place of no carrier [Hz]."""
+        wavelength = speed_of_light / (carrier or otherwise)
         # Friis: the loss is 20 log10(4 pi d / wavelength).
         return sample.labels + 20 * (4 * math.pi * distances / wavelength).log10()
 
@@ -71,13 +71,20 @@ def check_power(links: Any) -> Iterator[Finding]:
 def sample_of_given(
     links: Any, most: int = 2000, fewest: int = 8
 ) -> tuple[Sample, list[str]] | None:
-    """Links of the receivers with a given place and ``fewest`` links or more, and their names."""
+    """Links of the receivers with a given place, and the names of these receivers.
+
+    None if there is no such receiver.
+
+    Args:
+        most: Largest number of links.
+        fewest: Number of links below which a receiver is left out.
+    """
     sample = sample_of(links, most)
     counts = sample.receivers.bincount(minlength=len(sample.positions))
-    used = counts >= fewest
+    is_used = counts >= fewest
     if links.uncertainties is not None:
-        used &= links.uncertainties == 0
-    numbers = used.nonzero()[:, 0]
+        is_used &= links.uncertainties == 0
+    numbers = is_used.nonzero()[:, 0]
     if not len(numbers):
         return None
     return _only(sample, numbers), [links.receivers[k].name for k in numbers.tolist()]
@@ -85,20 +92,19 @@ def sample_of_given(
 
 def check_conventions(sample: Sample) -> Iterator[Finding]:
     """A finding if levels follow the distance much better in another unit or other axes."""
-    rows = [
+    others = [
         *of_frames(),
         *of_units([("tx",), ("rx",)]),
         *of_axes(sample, [("rx",)]),
         *of_plans(sample),
     ]
-    logarithms = torch.stack([decades(row.change(sample)) for row in rows])  # (h, n)
+    logarithms = torch.stack([decades(other.change(sample)) for other in others])  # (h, n)
     errors = fit_law(logarithms, sample).errors
     best = int(errors.abs().clamp_max(30).mean(1).argmin())
     gain = _gain(sample, errors[best])
     if gain is not None:
-        yield _finding(
-            "coordinates of receivers", "levels", gain, f"if {rows[best].name}", rows[best].mend
-        )
+        under = f"if {others[best].name}"
+        yield _finding("coordinates of receivers", "levels", gain, under, others[best].mend)
 
 
 def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
@@ -106,18 +112,20 @@ def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
     count = len(names)
     if not 2 <= count <= 64:
         return
-    apart = torch.cdist(sample.positions, sample.transmitters)  # (r, n)
-    errors = fit_law(decades_of(apart), sample).errors  # (r, n), from every place
+    # Errors of each link's level if its receiver stood at each of the places.
+    distances = torch.cdist(sample.positions, sample.transmitters)  # (place, n)
+    errors = fit_law(decades_of(distances), sample).errors  # (place, n)
     sums = torch.zeros(count, count, dtype=errors.dtype)
-    sums.index_add_(1, sample.receivers, errors.abs().clamp_max(30))
+    sums.index_add_(1, sample.receivers, errors.abs().clamp_max(30))  # (place, receiver)
     costs = (sums / sample.receivers.bincount()).T  # (receiver, place)
     costs.diagonal().mul_(0.9)  # receivers stay unless another place is clearly better
-    order = torch.from_numpy(linear_sum_assignment(costs.numpy())[1])
+    order = torch.from_numpy(linear_sum_assignment(costs.numpy())[1])  # place of each receiver
     moved = (order != torch.arange(count)).nonzero()[:, 0]
     if not len(moved):
         return
-    links = torch.isin(sample.receivers, moved).nonzero()[:, 0]
-    gain = _gain(_only(sample, moved), errors[order[sample.receivers[links]], links])
+    links = torch.isin(sample.receivers, moved).nonzero()[:, 0]  # of the moved receivers
+    places = order[sample.receivers[links]]
+    gain = _gain(_only(sample, moved), errors[places, links])
     if gain is None:
         return
     mend = "are names or places exchanged?"
@@ -148,19 +156,27 @@ def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[
         shift, gain = best_shift(alone)
         if gain is None:
             continue
-        at = ", ".join(f"{x:.4g}" for x in (alone.positions[0, :2] + shift).tolist())
-        text = f"from ({at}) m, {shift.norm():.3g} m off its place"
+        place = (alone.positions[0, :2] + shift).tolist()
+        shown = ", ".join(f"{x:.4g}" for x in place)
+        text = f"from ({shown}) m, {shift.norm():.3g} m off its place"
         mend = "check its place, name, axes and unit"
         findings.append(_finding("place of a receiver", f"levels of {name}", gain, text, mend))
     yield from sorted(findings, key=_share)[:most]
 
 
 def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain | None]:
-    """The common shift along x and y that explains levels best, within twice the extent."""
+    """The common shift of all receivers along x and y [m] that explains levels best.
+
+    The second result is its gain; None if the gain is not clear. The search starts with the
+    receivers' mean in the middle of the transmitters, and reaches as far as their extent.
+
+    Args:
+        cells: Number of grid points on each side of the middle.
+    """
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     offsets = sample.transmitters - sample.positions[sample.receivers]  # (n, 3)
     shift = ((low + high) / 2 - sample.positions.mean(0))[:2]
-    fits = torch.zeros_like(sample.labels)
+    fits = torch.zeros_like(sample.labels)  # errors under the best shift [dB]
     width = (high - low).max() / cells
     for _ in range(3):  # three grids, each finer by a factor of three
         steps = torch.arange(-cells, cells + 1) * width
@@ -177,8 +193,12 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
     """The gain of a law with the errors ``fits`` over the law of the data as read.
 
-    None if chance explains the gain, or if antennas do: a directional law of the data as read then
-    fits as well. ``is_fitted`` means that places were fitted to the levels, so chance does more.
+    None if the gain may be due to chance, or to directional antennas: a law of the data as read
+    with antenna patterns then fits as well.
+
+    Args:
+        fits: Errors of the law under another convention [dB].
+        is_fitted: True if places were fitted to the levels. Chance then explains more.
     """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)
@@ -191,7 +211,10 @@ def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) ->
 
 
 def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Finding:
-    """The finding that levels fit the law of distance better under another convention."""
+    """The finding that levels fit the law of distance better under another convention.
+
+    ``subject`` and ``under`` are the start and the end of its sentence: levels, and convention.
+    """
     text = (
         f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
     )
@@ -206,7 +229,7 @@ def _share(finding: Finding) -> float:
 
 
 def _only(sample: Sample, numbers: Int[Tensor, " k"]) -> Sample:
-    """The links of some receivers, renumbered."""
+    """The links of the receivers with these numbers, which become 0, 1, ..."""
     links = sample.at(torch.isin(sample.receivers, numbers).nonzero()[:, 0])
     _, receivers = links.receivers.unique(return_inverse=True)
     return replace(

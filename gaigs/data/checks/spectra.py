@@ -38,8 +38,11 @@ def check_extremes(links: Any) -> Iterator[Finding]:
             f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x "
             f"{columns}"
         )
-    parts = (labels[index].flatten(1) for index in torch.arange(len(labels)).split(256))
-    low, high = torch.cat([torch.stack((part.amin(1), part.amax(1)), 1) for part in parts]).T
+    ranges = []
+    for index in torch.arange(len(labels)).split(256):  # as many as fit into memory
+        pixels = labels[index].flatten(1)  # (256, pixels)
+        ranges.append(torch.stack((pixels.amin(1), pixels.amax(1)), 1))
+    low, high = torch.cat(ranges).T  # (n,) each
     constant = low == high
     if constant.all():
         raise ValueError(
@@ -92,7 +95,7 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
         return
     directions = Directions(links.task.directions, sample, limits.pixels)
     sample = replace(sample, labels=directions.ranks)
-    read = directions.scores(sample)
+    read = directions.scores(sample)  # score of each link as the data were read
     best = best_directions(links, sample, directions, read, limits)
     if best is not None:
         yield Finding(
@@ -106,13 +109,14 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
             "spectra",
         )
         return
-    # Near places of a survey have more in common, also behind walls.
-    alike = near_likeness(sample)
-    is_dark = read.mean() < 2 * read.std() / math.sqrt(len(read))
-    if len(read) >= limits.near and is_dark and alike < 0.1:
+    # In a survey spectra of near places are similar, also behind walls. If they are not, places
+    # and spectra may be in different orders.
+    likeness = near_likeness(sample)
+    is_dark = read.mean() < 2 * read.std() / math.sqrt(len(read))  # two standard errors
+    if len(read) >= limits.near and is_dark and likeness < 0.1:
         text = (
             "spectra are not bright towards their transmitters, and near places have a "
-            f"correlation of {alike:.2f}"
+            f"correlation of {likeness:.2f}"
         )
         yield Finding("order of rows", text, "are places and spectra in the same order?")
 
@@ -169,7 +173,13 @@ def best_directions(
     read: Float[Tensor, " n"],
     limits: Limits,
 ) -> Scored | None:
-    """The convention with a clearly higher score than ``read``; None if there is none."""
+    """The convention with a clearly higher score than the data as read; None if there is none.
+
+    Args:
+        sample: Links with the ranks of their pixels as labels.
+        directions: Brightness of the sample's spectra.
+        read: Score of each link under the convention as read.
+    """
     best: Scored | None = None
     is_known = bool(read.mean() >= limits.known)
     for conventions, deviations, step in trials(links, sample, directions, is_known, limits):
@@ -177,14 +187,15 @@ def best_directions(
         means = []
         for convention in conventions:
             means.append(directions.scores(convention.change(few)).mean().item())
-        # Of equal ones the first is the likeliest fault.
+        # Conventions are sorted, likeliest fault first: take the first of nearly equal scores.
         first = next(k for k, mean in enumerate(means) if mean > max(means) - 0.01)
         scores = directions.scores(conventions[first].change(sample))
         score = scores.mean().item()
         excess = scores - read
+        # Standard error of the mean, with near places counted as one.
         needed = deviations * excess.std().item() / math.sqrt(directions.places)
         is_clear = excess.mean() >= max(limits.better, needed, limits.share * score)
-        # A pair has to be better than one fault, which is simpler.
+        # A pair (step 2) has to be clearly better than one fault, which is simpler.
         least = (best.score if best else 0.0) + limits.better * (step - 1)
         if is_clear and score > least:
             best = Scored(conventions[first], score)
@@ -192,11 +203,15 @@ def best_directions(
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with that of the nearest place, without the mean."""
-    pixels = sample.labels.flatten(1)
-    likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
-    apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
-    return likeness.gather(1, apart.argmin(1, keepdim=True)).mean().item()
+    """Mean correlation of each spectrum with the spectrum of the nearest place.
+
+    The mean of all spectra is subtracted first.
+    """
+    pixels = sample.labels.flatten(1)  # (n, pixels)
+    correlations = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
+    distances = torch.cdist(sample.transmitters, sample.transmitters)  # (n, n)
+    nearest = distances.fill_diagonal_(math.inf).argmin(1, keepdim=True)  # (n, 1)
+    return correlations.gather(1, nearest).mean().item()
 
 
 class Directions:
@@ -214,28 +229,36 @@ class Directions:
         column_step = math.ceil(grid.shape[1] / pixels[1])
         self.grid = grid.thin(slice(None, None, row_step), slice(None, None, column_step))
         labels = sample.labels[:, ::row_step, ::column_step]
-        ranks = labels.flatten(1).argsort(1).argsort(1)  # (n, pixels)
+        order = labels.flatten(1).argsort(1)  # (n, pixels), the darkest pixel first
+        ranks = order.argsort(1)  # the inverse permutation
         self.ranks = (ranks / (ranks.shape[1] - 1)).reshape(labels.shape).float()
         places = sample.transmitters - sample.transmitters.amin(0)
         cells = (6 * places / places.amax().clamp_min(1e-9)).floor()  # (n, 3)
         self.places = len(cells.unique(dim=0))
 
     def scores(self, sample: Sample) -> Float[Tensor, " n"]:
-        """The score of each link; transmitters beyond the grid's elevations count as dark."""
+        """The score of each link, as ``check_directions`` describes it.
+
+        Transmitters beyond the grid's elevations count as dark.
+
+        Args:
+            sample: Links with the ranks of their pixels as labels.
+        """
         azimuths, elevations, _ = to_spherical(sample.local.float())
-        rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
-        columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
-        # Share of brighter pixels (spectrum, transmitter).
-        brighter = 1 - sample.labels[:, rows, columns]
+        # Pixel nearest to each transmitter. The cosine makes azimuths periodic.
+        rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)  # (n,)
+        columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)  # (n,)
+        # Share of brighter pixels, for each spectrum towards all transmitters.
+        brighter = 1 - sample.labels[:, rows, columns]  # (spectrum, transmitter)
         # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
         least = 0.02
         rareness = ((brighter + least).log() / math.log(least)).clamp_min(0)
         low, high = self.grid.elevations.aminmax()
-        seen = (elevations > low - self.grid.pitch) & (elevations < high + self.grid.pitch)
-        rareness = rareness * seen  # (spectrum, transmitter)
-        # Towards each transmitter, the mean over all spectra of its receiver.
-        same = (sample.receivers[:, None] == sample.receivers).float()
-        usual = (rareness * same).sum(0) / same.sum(0)
+        is_seen = (elevations > low - self.grid.pitch) & (elevations < high + self.grid.pitch)
+        rareness = rareness * is_seen  # (spectrum, transmitter)
+        # Mean towards each transmitter over all spectra of its receiver.
+        is_same_receiver = (sample.receivers[:, None] == sample.receivers).float()  # (n, n)
+        usual = (rareness * is_same_receiver).sum(0) / is_same_receiver.sum(0)  # (n,)
         return rareness.diagonal() - usual
 
 
@@ -249,7 +272,7 @@ def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
 
 
 def pixel_changes(sample: Sample) -> list[Hypothesis]:
-    """Other orders of the pixels, and other signs."""
+    """Conventions with another order of the pixels, or inverted amplitudes."""
     changes = [
         ("rows are upside down", lambda labels: labels.flip(1), "spectra = spectra[:, ::-1]"),
         (
@@ -265,15 +288,15 @@ def pixel_changes(sample: Sample) -> list[Hypothesis]:
 
 
 def column_changes(grid: Grid) -> list[Hypothesis]:
-    """Other azimuths of the spectra's columns."""
+    """Conventions with other azimuths of the spectra's columns."""
 
     def moved(turn: float, sign: int) -> Callable[[Sample], Sample]:
-        """A function that reads columns at azimuths ``turn`` + ``sign`` * azimuth."""
-        azimuths = sign * (grid.azimuths - turn)
-        source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
+        """A function that reads a column at azimuth a as if at ``turn`` + ``sign`` * a [rad]."""
+        azimuths = sign * (grid.azimuths - turn)  # a for each azimuth of the grid
+        source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # nearest columns
         return lambda read: replace(read, labels=read.labels[:, :, source])
 
-    # Such as -90..90 degrees.
+    # Azimuths such as -90..90 degrees are mirrored by the reverse order.
     is_symmetric = torch.allclose(grid.azimuths, -grid.azimuths.flip(0), atol=1e-3)
     columns = "::-1" if is_symmetric else "-np.arange(columns)"
     changes = [
@@ -292,8 +315,9 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
 
 
 def order_changes(links: Any) -> list[Hypothesis]:
-    """Other orders of transmitters."""
+    """Conventions with another order of the transmitters."""
     total = len(links)
+    # Number of the transmitter of each spectrum.
     orders = {
         "spectra are one row late": [max(k - 1, 0) for k in range(total)],
         "spectra are one row early": [min(k + 1, total - 1) for k in range(total)],
@@ -301,14 +325,14 @@ def order_changes(links: Any) -> list[Hypothesis]:
     }
     for first in (0, 1):
         names = [str(k + first) for k in range(total)]
-        orders[f"spectra are sorted by name ({first}, 10, 11, ... 2)"] = sorted(
-            range(total), key=names.__getitem__
-        )
+        by_name = sorted(range(total), key=names.__getitem__)
+        orders[f"spectra are sorted by name ({first}, 10, 11, ... 2)"] = by_name
     changes = []
     for name, order in orders.items():
         places = links.query.transmitters[order].double()
 
-        def change(read, places=places):
+        # The default binds the places of this turn of the loop.
+        def change(read: Sample, places=places) -> Sample:
             return replace(read, transmitters=places[read.index])
 
         changes.append(Hypothesis(name, change, "sort spectra and positions alike"))
@@ -316,8 +340,11 @@ def order_changes(links: Any) -> list[Hypothesis]:
 
 
 def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
-    """Transmitters that were scaled, with scales and offsets that suit the spectra best."""
-    scale = scale_of(sample.transmitters)
+    """Conventions under which transmitters are scaled, such as to 0..1.
+
+    Each one has another guess of scale and offset. Places that look unscaled give none.
+    """
+    scale = scale_of(sample.transmitters)  # in words; empty without a scaling
     if not scale:
         return []
     mend = "undo it, such as tx = middle + half_extent * tx"
@@ -339,7 +366,7 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     """
     receiver = int(sample.receivers.bincount().argmax())
     links = (sample.receivers == receiver).nonzero()[:, 0]
-    brightest = sample.labels[links].flatten(1).argmax(1)
+    brightest = sample.labels[links].flatten(1).argmax(1)  # (k,)
     pixels = grid.flatten()[brightest]
     local = from_spherical(pixels.azimuths, pixels.elevations).double()
     directions = local @ sample.rotations[receiver].T  # u, world frame (k, 3)
@@ -351,15 +378,16 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     generator = torch.Generator().manual_seed(0)
     threes = [torch.randperm(len(links), generator=generator)[:3] for _ in range(draws)]
     systems = equations[torch.stack(threes)].flatten(1, 2)  # (draws, 9, 6)
-    # The solution of A x = 0 is the last right singular vector; its sign is free.
+    # The best solution of A x = 0 is the right singular vector of the smallest singular value, the
+    # last one. Its sign is free, and the first scale is made positive.
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
     solutions = solutions * solutions[:, :1].sgn()
     changes: list[Callable[[Sample], Sample]] = []
     for solution in solutions[(solutions[:, :3] > 0).all(1)]:
-
-        def change(other: Sample, scales=solution[:3], offsets=solution[3:]) -> Sample:
-            places = other.positions[receiver] + scales * other.transmitters + offsets
-            return replace(other, transmitters=places)
+        # The defaults bind the solution of this turn of the loop.
+        def change(read: Sample, scales=solution[:3], offsets=solution[3:]) -> Sample:
+            places = read.positions[receiver] + scales * read.transmitters + offsets
+            return replace(read, transmitters=places)
 
         changes.append(change)
     return changes

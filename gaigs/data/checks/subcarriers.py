@@ -24,17 +24,19 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
     few = evenly(torch.arange(len(links)), 64)
-    # Most subcarriers are channels, which few links show.
+    # A few links exclude most subcarriers, so that all links are read at the others only.
     for index in (few, torch.arange(len(links))):
         values = links.labels[index]
         receivers = links.query.receivers[index]
+        # True where the array of a link's receiver lacks the element or the subcarrier.
         absent = lacking(links.receivers, receivers, values.shape[1], links.task.frequencies)
         absent = absent[..., chosen]  # (n, e, k)
         strengths = values.abs().amax((1, 2))[:, None, None]
         values = values[..., chosen]
-        # The value of the first link that has the element and the subcarrier (1, e, k).
-        first = values.gather(0, absent.int().argmin(0, keepdim=True))
-        is_same = ((values == first) | absent).all(0).all(0)
+        # The value of the first link that has the element and the subcarrier.
+        first_link = absent.int().argmin(0, keepdim=True)  # (1, e, k)
+        first = values.gather(0, first_link)
+        is_same = ((values == first) | absent).all(0).all(0)  # (k,)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
         chosen = chosen[is_same | is_faint]
         if not len(chosen) or len(index) < 5:
@@ -77,11 +79,10 @@ def check_powers(sample: Sample) -> Iterator[Finding]:
 
 
 def order_of_subcarriers(sample: Sample) -> Finding | None:
-    """A finding if channels jump within the band, and continue from its last to its first
-    subcarrier.
+    """A finding if channels jump within the band, and continue from its end to its start.
 
-    A jump is a low correlation of neighbouring subcarriers. Phases and delays of links do not
-    change this correlation.
+    The order of an FFT has this property. A jump is a low correlation of neighbouring subcarriers.
+    Phases and delays of links do not change this correlation. None if the order seems right.
     """
     order = sample.frequencies.argsort()
     count = len(order)
@@ -90,14 +91,16 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
         return None
     powers = values.abs().square().mean((1, 2), keepdim=True)
     values = values / torch.where(powers > 0, powers, 1).sqrt()
-    # The last step leads from the band's end to its start.
+    # Phase from each subcarrier to the next; the last step leads from the band's end to its start.
     steps = values.roll(-1, 2) * values.conj()  # (n, e, s)
-    turn = steps.sum((1, 2), keepdim=True).sgn().conj()
+    # A link's delay turns all its steps by one angle, which is removed.
+    turn = steps.sum((1, 2), keepdim=True).sgn().conj()  # (n, 1, 1)
+    single = (steps * turn).sum((0, 1)).abs()  # (s,)
     # Where a subcarrier is left out between two, the phase turns twice as far.
-    likeness = torch.stack([(steps * turn**power).sum((0, 1)).abs() for power in (1, 2)]).amax(0)
-    likeness = likeness / steps.abs().sum((0, 1)).clamp_min(1e-300)
+    double = (steps * turn**2).sum((0, 1)).abs()  # (s,)
+    likeness = torch.maximum(single, double) / steps.abs().sum((0, 1)).clamp_min(1e-300)
     usual = likeness.median().item()
-    around = likeness[-1].item()
+    around = likeness[-1].item()  # from the last subcarrier to the first
     jump = int(likeness[:-1].argmin())
     least = likeness[jump].item()
     bound = min(usual, around) - 0.3

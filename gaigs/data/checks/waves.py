@@ -32,17 +32,28 @@ class FewWaves(NamedTuple):
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances from transmitters to elements [m]; for missing elements to the array's middle."""
+    """Distances from transmitters to elements [m].
+
+    For elements that a smaller array lacks, the distance is to its receiver's position.
+    """
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
-    places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
+    # Offsets along the world's axes.
+    offsets = torch.einsum("rwa,rea->rew", sample.rotations, elements)  # (r, e, 3)
+    places = sample.positions[:, None] + offsets
     return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)
 
 
 def waves_at_few(sample: Sample, elements: int = 8, subcarriers: int = 6) -> FewWaves:
-    """Channels and direct waves at a few elements and subcarriers, evenly spread."""
+    """Channels and direct waves at a few elements and subcarriers, evenly spread.
+
+    Args:
+        elements: Largest number of elements.
+        subcarriers: Largest number of subcarriers.
+    """
     chosen = evenly(torch.arange(sample.labels.shape[1]), elements)
     tones = evenly(torch.arange(len(sample.frequencies)), subcarriers)
-    wavenumbers = -2 * math.pi / speed_of_light * sample.frequencies[tones]
+    # Phase -2 pi f d / c of a wave at distance d.
+    wavenumbers = -2 * math.pi / speed_of_light * sample.frequencies[tones]  # (s,)
     phases = direct_distances(sample)[:, chosen, None] * wavenumbers  # (n, e, s)
     sizes = torch.tensor([len(array) for array in sample.elements])[sample.receivers]
     exists = (chosen < sizes[:, None])[..., None]  # (n, e, 1)
@@ -55,7 +66,11 @@ def waves_at_few(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Few
 
 
 def has_extent(sample: Sample) -> bool:
-    """False if distances differ by under a wavelength, or an array is below a tenth of one."""
+    """True if distances and arrays are large enough to show phases.
+
+    Distances must have a standard deviation above a wavelength. Arrays with an extent must have at
+    least a tenth of a wavelength.
+    """
     wavelength = speed_of_light / sample.frequencies.mean()
     for array in sample.elements:
         extent = (array.amax(0) - array.amin(0)).norm()
@@ -75,9 +90,11 @@ def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
     """Fraction of power in each receiver's mean channel, after division by the direct wave.
 
     The two rows are for the two signs of the wave's phase. The mean is over links, and the fraction
-    expected by chance is subtracted. Each element and subcarrier has its own mean, since it may
-    have an unknown phase that all links share. ``is_calibrated`` takes one mean over all elements
-    and subcarriers.
+    expected by chance is subtracted. Each element and subcarrier has its own mean, since an unknown
+    phase of the element or subcarrier may be common to all links.
+
+    Args:
+        is_calibrated: True to take one mean over all elements and subcarriers.
     """
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     by_sign = []
@@ -86,8 +103,8 @@ def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
             unwound = unwound.mean((1, 2), keepdim=True)
         totals = unwound.new_zeros(len(counts), *unwound.shape[1:])
         totals = totals.index_add(0, sample.receivers, unwound)  # (r, e, s)
-        # n |mean|^2 over n links, which is 1 by chance.
-        powers = totals.abs().square().mean((1, 2)) / counts.clamp_min(1)
+        # |sum|^2 / n over n links of power 1: it is 1 by chance, and n for equal phases.
+        powers = totals.abs().square().mean((1, 2)) / counts.clamp_min(1)  # (r,)
         by_sign.append((powers - 1) / (counts - 1).clamp_min(1) * (counts > 1))
     return torch.stack(by_sign)
 
@@ -95,11 +112,12 @@ def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
 def coherence(sample: Sample, is_calibrated: bool = False) -> float:
     """Mean of ``shares`` over the links, with the better sign."""
     counts = sample.receivers.bincount(minlength=len(sample.positions)).double()
-    return (shares(sample, is_calibrated) @ counts / counts.sum()).max().item()
+    by_sign = shares(sample, is_calibrated) @ counts / counts.sum()  # (2,)
+    return by_sign.max().item()
 
 
 def likeness(sample: Sample) -> float:
-    """Fraction of power that the direct wave explains after the best phase of each link.
+    """Fraction of power that the direct wave explains after the best phase for each link.
 
     Each element and subcarrier may have a further phase, the same in all links.
     """
@@ -108,11 +126,12 @@ def likeness(sample: Sample) -> float:
         power = 0.0
         for receiver in sample.receivers.unique():
             links = unwound[sample.receivers == receiver].flatten(1)  # (k, m)
-            # The pattern of phases common to all links is the first right singular vector, by the
-            # power method.
+            # The pattern v of phases common to all links A is the first right singular vector, by
+            # the power method.
             common = torch.ones_like(links[0])
             for _ in range(3):
                 common = links.mH @ (links @ common)
+            # Power of the links along the pattern, |A v|^2 / |v|^2.
             size = common.abs().square().sum().clamp_min(1e-300)
             power += ((links @ common).abs().square().sum() / size).item()
         by_sign.append(power / unwound.numel())

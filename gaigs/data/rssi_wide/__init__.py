@@ -95,7 +95,7 @@ def from_table(
         levels: Columns that are gateways whatever their numbers look like.
     """
     axes = find_axes(table, coordinates)
-    others: list[str] = []
+    others: list[str] = []  # columns of a long table that are not used
     if receiver is not None or level is not None:
         table, axes, others = pivoted(table, axes, receiver, level)
         levels = table.names[len(axes.columns) :]
@@ -107,8 +107,9 @@ def from_table(
     count = int(is_placed.sum())
     if not count:
         raise ValueError(f"{table.file}: expected rows with coordinates, got none")
-    everything = np.array([*points[is_placed], *placed.values()])
-    world = _to_world(table, axes, everything, count, epsg, name_of_gateways(gateways))
+    # Places and gateways are converted together, to one frame.
+    points_and_gateways = np.array([*points[is_placed], *placed.values()])
+    world = _to_world(table, axes, points_and_gateways, count, epsg, name_of_gateways(gateways))
     stands = dict(zip(placed, world.points[count:].tolist(), strict=True))
 
     readings = table.numbers[is_placed][:, columns.gateways]  # (rows, gateways)
@@ -153,8 +154,8 @@ def _to_links(
         names: Names of these gateways, in the order of their columns.
         positions: Position of each of them [m]; None if unknown.
     """
-    rows, columns = survey.counts.nonzero()
-    receivers = np.unique(columns, return_inverse=True)[1]
+    rows, columns = survey.counts.nonzero()  # place and gateway of each link
+    receivers = np.unique(columns, return_inverse=True)[1]  # numbers among gateways with a reading
     nowhere = [0.0, 0.0, 0.0]  # until the training links estimate it
     uncertainties = [math.inf if position is None else 0.0 for position in positions]
     places = torch.from_numpy(survey.places).float()[rows]
@@ -188,7 +189,7 @@ def _remarks_on_readings(
     marks: Sequence[float],
     silent: Sequence[str],
 ) -> list[str]:
-    """Remarks on readings that were averaged or left out."""
+    """Remarks on readings that were averaged, and on cells and ``silent`` gateways left out."""
     how = f"{and_list(marks)}, or empty" if marks else "empty ones"
     remarks = [f"{int((~received).sum())} cells were not heard: {how}"]
     if survey.repeats:
@@ -211,16 +212,16 @@ def _remarks_on_heights(axes: Axes, placed: Mapping, height: float, storey: floa
     if axes.is_floor:
         return [f"heights are those of floors, {storey:g} m each (data.storey)"]
     # The gateways' file may have no height.
-    level = [name for name, place in placed.items() if place[2] == height]
-    if not level:
+    at_height = [name for name, place in placed.items() if place[2] == height]
+    if not at_height:
         return []
-    return [f"gateways that are {height:g} m high (data.height): {tables.shortened(level)}"]
+    return [f"gateways that are {height:g} m high (data.height): {tables.shortened(at_height)}"]
 
 
 def _remarks_on_gateways(
     file: str, names: Sequence[str], stands: Mapping, unused: Sequence[str]
 ) -> list[str]:
-    """Remarks on the file of gateways: those that it lacks, and those without a column."""
+    """Remarks on gateways that the file lacks, and on its ``unused`` gateways without a column."""
     remarks = []
     unplaced = [name for name in names if name not in stands]
     if unplaced:

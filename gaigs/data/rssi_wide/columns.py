@@ -71,11 +71,14 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors from the units in the headings of x, y and z to metres.
+    """Factors of x, y and z, from the units in their headings to metres.
 
-    If the unit of the system ``epsg`` is not the metre, x and y stay in this unit. Raises a
-    ``ValueError`` if a heading then has another unit.
+    If the unit of the coordinate system ``epsg`` is not the metre, x and y stay in this unit.
+
+    Raises:
+        ValueError: A heading has another unit than such a system.
     """
+    # Without z, its place is filled by x.
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
     metres = 1.0 if epsg is None else metres_of(epsg)
@@ -89,7 +92,7 @@ def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
                 f"m, and data.epsg={epsg} in {kind}\n"
                 "mend the heading, or name the system of these coordinates"
             )
-        units[k] = 1.0
+        units[k] = 1.0  # in the system's unit already
     if axes.is_floor:
         units[2] = 1.0
     return [1.0 if unit is None else unit for unit in units]
@@ -116,29 +119,32 @@ def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> 
         is_floor = z >= 0 and plain[z] in FLOORS
         return Axes(x, y, z, is_floor, plain[x] in longitudes and not has_unit[x])
 
-    def columns_of(names):
+    def columns_of(names: Collection[str]) -> list[int]:
         return [k for k, name in enumerate(plain) if name in names]
 
     here = table.heading
     for first, second in PAIRS:
-        x, y = columns_of(first), columns_of(second)
-        if not (x and y):
+        xs = columns_of(first)
+        ys = columns_of(second)
+        if not (xs and ys):
             continue
         heights = columns_of(HEIGHTS)
-        z = heights or columns_of(FLOORS)
-        for columns in (x, y, z):
+        zs = heights or columns_of(FLOORS)
+        for columns in (xs, ys, zs):
             if len(columns) > 1:
                 doubled = ", ".join(table.names[k] for k in columns)
                 raise ValueError(
                     f"{here}: several columns of one coordinate, {doubled}; choose by "
                     "data.coordinates"
                 )
-        is_global = first is longitudes and not has_unit[x[0]]
-        return Axes(x[0], y[0], z[0] if z else -1, bool(z) and not heights, is_global)
-    several = [name for k, name in enumerate(table.names) if tables.numbers_in(table.text(0, k))]
+        is_global = first is longitudes and not has_unit[xs[0]]
+        z = zs[0] if zs else -1
+        return Axes(xs[0], ys[0], z, bool(zs) and not heights, is_global)
+    # A column such as "(1.0, 2.0)" has all coordinates in one cell.
+    joined = [name for k, name in enumerate(table.names) if tables.numbers_in(table.text(0, k))]
     hint = ""
-    if several:
-        hint = f"; column {several[0]} holds several numbers: give each its column"
+    if joined:
+        hint = f"; column {joined[0]} holds several numbers: give each its column"
     raise ValueError(
         f"{here}: expected columns x and y, easting and northing, or longitude and latitude, got "
         f"{tables.quote(', '.join(table.names))}; name them by data.coordinates=[x,y]{hint}"
@@ -148,7 +154,14 @@ def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> 
 def refuse_cells(
     table: tables.Table, columns: Sequence[int], wrong: Bool[ndarray, "rows c"], expected: str
 ) -> None:
-    """Raises a ``ValueError`` with the first wrong cell of each row."""
+    """Raises a ``ValueError`` for wrong cells; nothing is raised if all are right.
+
+    Args:
+        columns: Columns of the table that were checked.
+        wrong: True for each wrong cell of these columns.
+        expected: What a cell must be, for the error.
+    """
+    # The first wrong cell of each row.
     cells = {}
     for row in np.flatnonzero(wrong.any(1)).tolist():
         cells[row] = table.cell(row, columns[int(wrong[row].argmax())])
@@ -164,12 +177,20 @@ def find_gateways(
 ) -> Columns:
     """The columns of gateways, and the values that mean "not heard" in them.
 
-    A gateway is a column of mostly low levels, or a column in ``placed``, the gateways with a given
-    place. Columns without a level are dropped. Raises a ``ValueError`` if there is no gateway, or
-    if a cell of a gateway is not a level.
+    A gateway is a column of mostly low levels, or a column in ``placed``. Columns without a level
+    are dropped.
+
+    Args:
+        placed: Names of columns that are gateways in any case, such as those with a given place.
+        ignore: Names of columns that are no gateways.
+        not_heard: Values that mean "not heard" [dBm]; None: ``marks_of`` finds them.
+
+    Raises:
+        ValueError: There is no gateway, or a cell of a gateway is not a level.
     """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]
+    # Codes of "not heard" are sought in columns that may be gateways.
     likely = [k for k in free if table.names[k] in placed or _is_weak(table, k)]
     marks = marks_of(table.numbers[:, likely]) if not_heard is None else marks_given(not_heard)
     gateways: list[int] = []
@@ -219,7 +240,7 @@ def find_gateways(
 
 
 def _is_weak(table: tables.Table, column: int) -> bool:
-    """True if half of a column's distinct numbers are low levels, and it is not a coordinate."""
+    """True if half of a column's distinct numbers are low levels, and no coordinate by its name."""
     if plain_name(table.names[column])[0] in HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2]):
         return False
     numbers = table.numbers[:, column]

@@ -28,7 +28,13 @@ def name_of_gateways(gateways: str | Path | Mapping | tables.Table | None) -> st
 def read_points(
     table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
 ) -> Float[ndarray, "rows 3"]:
-    """Coordinates of all rows; NaN for empty cells."""
+    """Coordinates of all rows: metres, or the unit of the system ``epsg``; NaN for empty cells.
+
+    Args:
+        height: Height of rows without one, and of floor 0 [m].
+        storey: Height of a storey [m].
+        epsg: Code of the coordinate system; None if unknown.
+    """
     columns = axes.columns
     if len({*columns}) < len(columns):
         names = [table.names[column] for column in columns]
@@ -53,12 +59,16 @@ def read_gateways(
 ) -> tuple[dict[str, list[float]], list[str]]:
     """Coordinates of gateways by the table's columns, and the names of gateways without a column.
 
+    Args:
+        given: File of gateways, or the gateways in memory; None: no gateway has a given place.
+        table: Table of readings, whose coordinates are in the columns ``axes``.
+
     Raises:
         ValueError: No gateway has a column, or the file or mapping has a defect.
     """
     if given is None:
         return {}, []
-    file: Path = Path(name_of_gateways(given))
+    file: Path = Path(name_of_gateways(given))  # for messages
     if isinstance(given, str | Path):
         file = tables.find_file(given, "a table of gateways")
         if file.suffix.lower() in (".yml", ".yaml"):
@@ -91,7 +101,11 @@ def _mapped_gateways(
 ) -> dict[str, list[float]]:
     """Coordinates of gateways by their names, from lists of x, y and optionally z.
 
-    Gateways without z, or on floor 0, have ``height`` [m]; floors are a ``storey`` apart [m].
+    Args:
+        units: Factors of x, y and z to metres.
+        axes: Columns of the table; if it has floors, z of a gateway is a floor, too.
+        height: Height of gateways without z, and of floor 0 [m].
+        storey: Height of a storey [m].
     """
     places = {}
     for name, value in given.items():
@@ -99,9 +113,11 @@ def _mapped_gateways(
         count = 2 if isinstance(value, list) and len(value) == 2 else 3
         vector = to_vector(f"{file}: {name}", value, "xyz"[:count])
         place = [unit * x for unit, x in zip(units, vector, strict=False)]  # z may be missing
-        if axes.is_floor:
-            place[2:] = [height + storey * floor for floor in place[2:]]
-        places[name] = [*place, height][:3]
+        if len(place) < 3:
+            place.append(height)
+        elif axes.is_floor:
+            place[2] = height + storey * place[2]
+        places[name] = place
     return places
 
 

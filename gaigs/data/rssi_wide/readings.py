@@ -41,27 +41,29 @@ def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | 
             f"{table.heading}: data.receiver={receiver} and data.level={level} must differ from "
             "each other and from the coordinates"
         )
-    count = len(table.numbers)
+    count = len(table.numbers)  # n readings
     texts = [table.text(row, named) for row in range(count)]
     nameless = {row: f"none in column {receiver}" for row, text in enumerate(texts) if not text}
     table.refuse(nameless, "a gateway's name")
     points = table.numbers[:, axes.columns]  # (n, 2 or 3)
+    # Number of the place and of the gateway of each reading.
     places = tables.number_places(points.tolist())[1].numpy()
     names, gateways = np.unique(texts, return_inverse=True)
 
     # The k-th reading of a gateway at a place goes to the place's k-th row.
     pairs = places * len(names) + gateways  # number of each pair of place and gateway
-    order = np.argsort(pairs, kind="stable")
-    starts = np.searchsorted(pairs[order], pairs[order])
-    repeats = np.empty(count, int)
+    order = np.argsort(pairs, kind="stable")  # readings of a pair in succession
+    starts = np.searchsorted(pairs[order], pairs[order])  # position of the pair's first reading
+    repeats = np.empty(count, int)  # k of each reading, from 0
     repeats[order] = np.arange(count) - starts
-    keys = places * (repeats.max() + 1) + repeats
+    keys = places * (repeats.max() + 1) + repeats  # number of each combination of place and k
     _, first, rows = np.unique(keys, return_index=True, return_inverse=True)
     source = np.full((len(first), len(names)), -1)  # number of the reading, -1 without one
     source[rows, gateways] = np.arange(count)
     levels = np.where(source >= 0, table.numbers[source, column], np.nan)
 
     def text_of(row: int, k: int) -> str:
+        """The text of a cell of the new table, for messages."""
         if k < len(axes.columns):
             return table.text(first[row], axes.columns[k])
         reading = source[row, k - len(axes.columns)]
@@ -120,18 +122,25 @@ def averaged(
     levels: Float[ndarray, "rows g"],
     received: Bool[ndarray, "rows g"],
 ) -> Survey:
-    """Means of the received levels of each place."""
+    """Means of the received levels of each place, in dB.
+
+    Args:
+        points: Place of each row of the table [m]; a place may have several rows.
+        levels: Level of each row at each gateway [dBm].
+        received: True for each level that was received.
+    """
     places, numbers = tables.number_places(points.tolist())
-    which = numbers.numpy()
+    place_of = numbers.numpy()  # number of each row's place
     counts = np.zeros((len(places), levels.shape[1]))
     sums = np.zeros_like(counts)
-    np.add.at(counts, which, received)
-    np.add.at(sums, which, np.where(received, levels, 0))
+    np.add.at(counts, place_of, received)
+    np.add.at(sums, place_of, np.where(received, levels, 0))
     means = sums / counts.clip(1)
     repeats = int(received.sum()) - int((counts > 0).sum())
     if not repeats:
         return Survey(np.array(places), counts, means, 0, 0.0, None)
-    errors = np.where(received, levels - means[which], 0)
+    errors = np.where(received, levels - means[place_of], 0)
+    # The number of repeats is that of readings less that of means: the degrees of freedom.
     scatter = math.sqrt(np.square(errors).sum() / repeats)
     noises = torch.from_numpy(scatter / np.sqrt(counts[counts > 0])).float()
     return Survey(np.array(places), counts, means, repeats, scatter, noises)

@@ -125,7 +125,13 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` in any room for ``PLACES_AT_A_TIME`` transmitters [m] at a time."""
+    """Responses of a receiver's elements, ``PLACES_AT_A_TIME`` transmitters at a time.
+
+    Args:
+        frequency: Carrier [Hz].
+        offsets: Frequencies relative to the carrier [Hz].
+        order: Largest number of reflections of a path.
+    """
     for part in transmitters.split(PLACES_AT_A_TIME):
         paths = trace(room, part, receiver.pose.position, frequency, order)
         yield respond(paths, receiver, frequency, offsets)
@@ -162,12 +168,12 @@ def spectra(
 
 
 def edges(room: Room) -> Float[Tensor, "k 2 3"]:
-    """Edges of the room and its furniture [m], 12 of each cuboid."""
+    """Edges of the room and its furniture as line segments [m], 12 for each cuboid."""
     corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))  # of the unit cube
     pairs = torch.combinations(torch.arange(8))
-    # An edge joins corners that differ along one axis.
-    steps = (corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1)
-    pairs = pairs[steps == 1]  # (12, 2)
+    # An edge joins corners that differ along a single axis.
+    differing_axes = (corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1)
+    pairs = pairs[differing_axes == 1]  # (12, 2)
     lower = torch.tensor([(0.0, 0.0, 0.0), *(box.lower for box in room.furniture)])
     upper = torch.tensor([room.size, *(box.upper for box in room.furniture)])
     points = lower[:, None] + (upper - lower)[:, None] * corners  # (cuboids, 8, 3)
@@ -178,15 +184,17 @@ def meshes(room: Room) -> list[Mesh]:
     """The room and its furniture: a mesh for each material of a cuboid."""
     # Corners of the faces in the order of ``Room.walls``, counterclockwise as seen from outside.
     sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    # Name, opposite corners, and material of each face.
     cuboids = [("room", (0.0, 0.0, 0.0), room.size, room.walls)]
     for box in room.furniture:
-        cuboids.append((box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6))
+        material = f"loss_{box.loss_db:g}_db"
+        cuboids.append((box.name, box.lower, box.upper, (material,) * 6))
     parts = []
     for name, lower, upper, materials in cuboids:
         corners = tuple(itertools.product(*zip(lower, upper, strict=True)))
         faces: dict[str, list[tuple[int, ...]]] = {}
         for side, material in zip(sides, materials, strict=True):
             faces.setdefault(material, []).append(side)
-        for material, alike in faces.items():
-            parts.append(Mesh(name, material, corners, tuple(alike)).compact())
+        for material, of_material in faces.items():
+            parts.append(Mesh(name, material, corners, tuple(of_material)).compact())
     return parts

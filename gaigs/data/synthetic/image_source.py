@@ -97,7 +97,12 @@ def cells(order: int) -> Int[Tensor, "p 3"]:
 def mirror(
     points: Float[Tensor, "*#batch 3"], cell: Int[Tensor, "*#batch 3"], size: Float[Tensor, "3"]
 ) -> Tensor:
-    """Positions of the room's points [m] in a mirrored copy of it."""
+    """Positions of the room's points [m] in a mirrored copy of the room.
+
+    Args:
+        cell: Number of the copy along each axis, from ``cells``. Odd numbers are mirrored.
+        size: Extent of the room [m].
+    """
     return cell * size + torch.where(cell % 2 == 0, points, size - points)
 
 
@@ -109,13 +114,15 @@ def passes(
 ) -> Tensor:
     """True for segments from ``start`` to ``end`` that pass through boxes along the axes.
 
-    The part inside a box is between the last entry and the first exit. A segment within a face
-    gives 0 / 0 = NaN, which counts as not passing.
+    Args:
+        lower, upper: Opposite corners of the boxes [m].
     """
     ray = end - start
-    # Shares of the segment at which it crosses the planes of the faces.
+    # Shares of the segment at which it crosses the planes of the faces. A segment within a face
+    # gives 0 / 0 = NaN, which counts as not passing.
     first = (lower - start) / ray
     second = (upper - start) / ray
+    # The part inside a box is between the last entry and the first exit of the three axes.
     entry = torch.minimum(first, second).amax(-1).clamp(min=0)
     exit_ = torch.maximum(first, second).amin(-1).clamp(max=1)
     return entry < exit_
@@ -158,27 +165,31 @@ def trace(
             f"transmitters and receiver must lie inside the room of {room.size} m and outside its "
             f"furniture, got {blocked[0].round(decimals=4).tolist()}; move it"
         )
-    cell = cells(order).to(size.device)
+    cell = cells(order).to(size.device)  # (p, 3)
     images = mirror(transmitters[:, None], cell, size)  # (b, p, 3)
     rays = images - receiver
-    cosines = rays.abs() / rays.norm(dim=-1, keepdim=True)
+    # Cosine of the angle of incidence on a wall across each axis.
+    cosines = rays.abs() / rays.norm(dim=-1, keepdim=True)  # (b, p, 3)
 
     gains = torch.ones_like(cosines[..., 0], dtype=torch.complex128)
     for wall, material in enumerate(room.walls):
-        axis, side = divmod(wall, 2)
+        axis, side = divmod(wall, 2)  # side 0 is at coordinate 0, side 1 at the room's size
         te, tm = fresnel(permittivity(material, frequency), cosines[..., axis])
-        # The wall on the image's side takes the odd one of m reflections between two opposite
-        # walls.
-        towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
-        bounces = (cell[:, axis].abs() + towards) // 2
-        gains = gains * (tm if axis == 2 else te) ** bounces
+        # Two opposite walls share the |i| reflections of copy i. If |i| is odd, the wall on the
+        # image's side has one more.
+        is_towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
+        reflections = (cell[:, axis].abs() + is_towards) // 2  # (p,)
+        gains = gains * (tm if axis == 2 else te) ** reflections
 
     if room.furniture:
-        corners = size.new_tensor([(box.lower, box.upper) for box in room.furniture])
-        mirrored = mirror(corners[:, :, None], cell, size)
-        through = passes(receiver, images[:, :, None, None], mirrored.amin(1), mirrored.amax(1))
-        counts = through.sum(-1).double()
-        loss_db = counts @ size.new_tensor([box.loss_db for box in room.furniture])
+        boxes = room.furniture
+        corners = size.new_tensor([(box.lower, box.upper) for box in boxes])  # (boxes, 2, 3)
+        mirrored = mirror(corners[:, :, None], cell, size)  # (boxes, 2, copies, 3)
+        ends = images[:, :, None, None]  # (b, p, 1, 1, 3)
+        lower, upper = mirrored.aminmax(dim=1)  # (boxes, copies, 3)
+        through = passes(receiver, ends, lower, upper)  # (b, p, boxes, copies)
+        counts = through.sum(-1).double()  # copies of each box that a path passes, (b, p, boxes)
+        loss_db = counts @ size.new_tensor([box.loss_db for box in boxes])
         gains = gains * 10 ** (-loss_db / 20)
     return Paths(images, gains)
 
@@ -194,8 +205,9 @@ def bounces(
     start = receiver.to(images)
     size = images.new_tensor(room.size)
     ray = images - start  # (b, p, 3)
-    planes = torch.arange(1 - order, order + 1).to(images)[:, None] * size  # (2 order, 3)
-    # Shares of the line at which it crosses each plane.
+    numbers = torch.arange(1 - order, order + 1).to(images)
+    planes = numbers[:, None] * size  # coordinates of the planes across each axis, (2 order, 3)
+    # Shares of the line at which it crosses each plane; planes beyond its ends count as NaN.
     shares = ((planes - start) / ray[:, :, None]).flatten(2)  # (b, p, 6 order)
     shares = torch.where((shares > 0) & (shares < 1), shares, torch.nan)
     shares = shares.sort(-1).values[..., :order]  # (b, p, order)
@@ -208,14 +220,14 @@ def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
     """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
     for box in room.furniture:
-        is_above = points >= points.new_tensor(box.lower)
-        is_below = points <= points.new_tensor(box.upper)
-        free &= ~(is_above & is_below).all(-1)
+        above_lower = points >= points.new_tensor(box.lower)
+        below_upper = points <= points.new_tensor(box.upper)
+        free &= ~(above_lower & below_upper).all(-1)
     return free
 
 
 def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, as by ``sample_band``, for the longest path of the room."""
+    """Frequencies from ``sample_band`` for the room's longest path, relative to the middle [Hz]."""
     return sample_band(bandwidth, (order + 1) * math.hypot(*room.size))
 
 
@@ -239,7 +251,7 @@ def respond(
     fields = []
     # 16 transmitters at a time: the waves of all paths take many times the memory of their sums.
     for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
-        local = (images - position) @ rotation  # (16, p, 3)
+        local = (images - position) @ rotation  # in the receiver's frame, (16, p, 3)
         gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
         distances = (images[:, :, None] - elements).norm(dim=-1)  # (16, p, elements)
         waves = free_space(distances[..., None], frequencies)  # (16, p, elements, f)
