@@ -53,10 +53,13 @@ class PathLoss(Model):
 
         A receiver without links gets the means of levels and exponents.
         """
+        self._fit_lines(without_gross_errors(links))
+
+    def _fit_lines(self, links: Links) -> None:
+        """``fit`` to links of which none has a gross error."""
         lines = []
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)
-        links = without_gross_errors(links)
         known = known_links(links, any_receiver=True)
         for index in filter(len, known):
             query, labels = links.query[index], links.labels[index].double()
