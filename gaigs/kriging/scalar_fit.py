@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,8 +21,8 @@ from gaigs.kriging.likelihood import (
     slopes,
 )
 from gaigs.kriging.links import scale_bounds
-from gaigs.kriging.neighbours import Around, HeldOutReadings
-from gaigs.processes import in_threads
+from gaigs.kriging.neighbours import HeldOutReadings
+from gaigs.processes import limited_threads
 
 
 @dataclass(frozen=True)
@@ -182,37 +181,23 @@ class HeldOutCost:
         The gradient of the matrices is written out; autograd would take several times as long.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
-        parts = [slice(first, first + 64) for first in range(0, len(self.asked), 64)]
-        totals, of_places = zip(
-            *in_threads(partial(self._likelihood_of, logarithms, choice), parts), strict=True
-        )
-        of_place = torch.cat(of_places)  # (m, 4)
-        gradient = torch.zeros_like(logarithms)
-        gradient.index_add_(0, self.around.receivers, of_place[:, :3])
-        return sum(totals), gradient, of_place[:, 3].sum().item()
-
-    def _likelihood_of(
-        self, logarithms: Float[Tensor, "r 3"], choice: Choice, rows: slice
-    ) -> tuple[float, Float[Tensor, "m 4"]]:
-        """Negative log likelihood of some held-out readings, and its ``slopes`` at each."""
-        around = Around(*(field if field is None else field[rows] for field in self.around))
-        hyperparameters = logarithms.exp()
-        noises = hyperparameters[around.receivers, 2].square()  # (m,)
-        between = covariances(around, hyperparameters, choice)
-        noise_power = noises[:, None] * self.factors[rows]  # (m, j)
-        given = conditional(between, self.readings[rows], noise_power)
+        receivers, hyperparameters = self.around.receivers, logarithms.exp()
+        noises = hyperparameters[receivers, 2].square()  # (m,)
+        between = covariances(self.around, hyperparameters, choice)
+        noise_power = noises[:, None] * self.factors  # (m, j)
+        given = conditional(between, self.readings, noise_power)
         with torch.enable_grad():
             leaves = [given.means, given.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
-            errors = self.asked[rows] - means
-            total = -log_density(errors, variances, noise, choice.degrees).sum()
+            total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
         of_place = slopes(  # (m, 4)
-            around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
+            self.around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
         )
         of_place[:, 2] += 2 * of_noise * noises
-        return total.item(), of_place
+        gradient = torch.zeros_like(logarithms).index_add(0, receivers, of_place[:, :3])
+        return total.item(), gradient, of_place[:, 3].sum().item()
 
     def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
         """The initial point: from earlier hyperparameters, or the best of a coarse grid."""
@@ -248,6 +233,7 @@ class HeldOutCost:
         return ScalarFit(cost, logarithms, choice._replace(scale=float(choice.scale)))
 
 
+@limited_threads(1)  # more take longer for many small matrices
 def maximise(cost: HeldOutCost, start: Float[Tensor, "r 3"] | None = None) -> ScalarFit:
     """The hyperparameters with the lowest cost, from ``start`` or a coarse grid.
 
