@@ -99,15 +99,22 @@ class LocalMixtures(NamedTuple):
         """Mixtures at places; readings in a place's ``own`` fold are not used for it."""
         readings = self.readings._replace(count=self.options.neighbours)
         nearest, sets = self._in_order(readings.nearest(places, receivers, own, folds))
-        order = sets.argsort()
+        _, which, counts = sets.unique(return_inverse=True, return_counts=True)
+        counts = counts[which]  # (m,) places with the same readings around
+        order = (counts * len(sets) + which).argsort()  # sets of one size after each other
+        sizes, totals = counts.unique(return_counts=True)
 
         def mixture(part: Int[Tensor, " n"]) -> LocalMixture:
             near = Nearest(nearest.rows[part], nearest.exists[part])
-            return self._mixture(places[part], receivers[part], near, sets[part])
+            count = int(counts[part[0]]) if len(part) else 1
+            return self._mixture(places[part], receivers[part], near, count)
 
-        parts = in_threads(mixture, order.split(self.options.size))
+        parts: list[Tensor] = []
+        for size, of_size in zip(sizes.tolist(), order.split(totals.tolist()), strict=True):
+            parts += of_size.split(max(1, self.options.size // size) * size)
+        mixtures = in_threads(mixture, parts or [order])
         back = order.argsort()
-        return LocalMixture(*(torch.cat(field)[back] for field in zip(*parts, strict=True)))
+        return LocalMixture(*(torch.cat(field)[back] for field in zip(*mixtures, strict=True)))
 
     def _in_order(self, nearest: Nearest) -> tuple[Nearest, Int[Tensor, " m"]]:
         """Readings around each place in an order of their own, and a hash of their places.
@@ -131,9 +138,12 @@ class LocalMixtures(NamedTuple):
         places: Float[Tensor, "m d"],
         receivers: Int[Tensor, " m"],
         nearest: Nearest,
-        sets: Int[Tensor, " m"],
+        count: int,
     ) -> LocalMixture:
-        """Mixtures at m places from the readings y around each, sorted by their ``sets``.
+        """Mixtures at m places from the readings y around each.
+
+        Each ``count`` successive places have the same readings around. They share the factors L;
+        candidates are the same at all receivers.
 
         A candidate has the matrix K = correlations + ratio I of readings and the correlations c
         with the place. With the Cholesky factor K = L L', the mean is (L^-1 c)' (L^-1 y), and the
@@ -144,12 +154,9 @@ class LocalMixtures(NamedTuple):
         near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
         # Missing readings correlate with nothing, not even with themselves.
         near = near.where(nearest.exists, 1e15)
-        # Places with the same readings around share the factors L; candidates are the same at all
-        # receivers.
-        _, which = sets.unique_consecutive(return_inverse=True)
-        first = torch.searchsorted(which, which.unique())
-        pairs = nearest.exists[first, :, None] & nearest.exists[first, None]
-        apart = distances(points[first], points[first]).where(pairs, 1e15)  # (u, j, j)
+        exists = nearest.exists[::count]  # (u, j)
+        pairs = exists[:, :, None] & exists[:, None]
+        apart = distances(points[::count], points[::count]).where(pairs, 1e15)  # (u, j, j)
         values = self.values[nearest.rows].where(nearest.exists, 0)  # (m, j)
         counts = nearest.exists.sum(1)
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
@@ -161,27 +168,29 @@ class LocalMixtures(NamedTuple):
         for step in options.lengths:
             correlations = matern(apart, (middle + step).exp(), self.choice.smoothness)
             at_place = matern(near, (middle + step).exp(), self.choice.smoothness)
-            both = torch.stack((at_place, values), 2)  # (m, j, 2)
+            both = torch.stack((at_place, values)).unflatten(1, (-1, count))  # (2, u, count, j)
+            both = both.permute(1, 3, 0, 2).flatten(2)  # (u, j, 2 count)
             prior = ((middle + step - lengths) / options.scatter).square() / 2
             for change in options.ratios:
                 logarithm = middle_ratio + change
                 ratio = logarithm.exp()
                 noise = ratio * torch.eye(values.shape[1]).to(values)
                 factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
-                white = torch.linalg.solve_triangular(factor[which], both, upper=False)
-                towards, rotated = white.unbind(2)  # (m, j), L^-1 c and L^-1 y
+                white = torch.linalg.solve_triangular(factor, both, upper=False)
+                towards, rotated = white.unflatten(2, (2, count)).unbind(2)  # (u, j, count)
                 # The receiver's variance of readings is the prior mean of signal plus noise.
                 prior_energy = options.degrees * total / (1 + ratio)
-                energy = prior_energy + rotated.square().sum(1)
-                determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)[which]
+                energy = prior_energy + rotated.square().sum(1).flatten()
+                determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)
+                determinant = determinant.repeat_interleave(count)
                 # Missing readings add the noise alone to the determinant.
                 determinant = determinant - (values.shape[1] - counts) * logarithm
                 likelihood = options.degrees * prior_energy.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()
                 ratio_prior = (logarithm - receiver_ratios).square() / 2
                 logarithms.append(likelihood / 2 - prior - ratio_prior)
-                means.append((towards * rotated).sum(1))
-                variance = 1 + ratio - towards.square().sum(1)  # over the signal's
+                means.append((towards * rotated).sum(1).flatten())
+                variance = 1 + ratio - towards.square().sum(1).flatten()  # over the signal's
                 squares.append(variance * energy / (options.degrees + counts))
         weights = torch.stack(logarithms, 1).log_softmax(1)
         degrees = (options.degrees + counts)[:, None]

@@ -53,9 +53,12 @@ class PathLoss(Model):
 
         A receiver without links gets the means of levels and exponents.
         """
+        self._fit_lines(without_gross_errors(links))
+
+    def _fit_lines(self, links: Links) -> None:
+        """``fit`` to links of which none has a gross error."""
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)
-        links = without_gross_errors(links)
         known = known_links(links, any_receiver=True)
         laws = []  # results of the fit at each receiver with links
         for index in filter(len, known):

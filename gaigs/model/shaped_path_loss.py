@@ -31,8 +31,8 @@ class ShapedPathLoss(PathLoss):
         self._fit_terms(links, chooses=False)
 
     def _fit_terms(self, links: Links, chooses: bool) -> None:
-        super().fit(links)
         links = without_gross_errors(links)
+        self._fit_lines(links)
         index = links.split.known
         law = super().forward(Batch(links.query[index])).value
         self.terms.fit(links, (links.labels[index] - law).double(), chooses)

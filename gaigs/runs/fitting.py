@@ -74,7 +74,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     held = drawn(links.split.validation)
     if kriged is not None and model.settles and len(held) > 1:
         with stages.timed("kriging"):
-            scores = kriged.law_scores(links, held)
+            # Cleaned as for kriging, which then needs no other law.
+            scores = kriged.law_scores(kriged.posterior.cleaned(links), held)
         # Two standard errors below its mean: kriging leaves out a room that is surely worse.
         rival = (scores.mean() - 2 * scores.std() / len(held) ** 0.5).item()
     with stages.stage(until=0.5 / config["ensemble"]), stages.timed("training"):
@@ -84,13 +85,13 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     model, config, more = _try_second_start(model, loss, links, config, folder)
     seconds += more
     if kriged is not None:
-        kriged = _untrained_kriging(model, links, config)
+        kriged = _untrained_kriging(model, links, config, kriged)
     trained = None
     if config["ensemble"] > 1:
         model, more = _add_members(model, loss, links, config, folder)
         seconds += more
         model.known_places = places
-        kriged = _untrained_kriging(model, links, config)
+        kriged = _untrained_kriging(model, links, config, kriged)
         trained = "members.0"  # where the weights of the checkpoint belong
         checkpoint.update(best, model, trained)
     model.calibration = calibrated(model, links)
@@ -131,9 +132,18 @@ def _checked(model: Model | None, links: Links, config: dict) -> Model:
     return model
 
 
-def _untrained_kriging(trend: Model, links: Links, config: dict) -> Kriging | None:
-    """The kriging of a model's residuals, not yet fitted; None if it is not configured."""
-    return Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
+def _untrained_kriging(
+    trend: Model, links: Links, config: dict, before: Kriging | None = None
+) -> Kriging | None:
+    """The kriging of a model's residuals, not yet fitted; None if it is not configured.
+
+    It keeps the law of distance that the kriging ``before`` has fitted.
+    """
+    if not config["kriging"]:
+        return None
+    kriged = Kriging(links.scene, trend, config["kriging_fallback"])
+    kriged.laws = None if before is None else before.laws
+    return kriged
 
 
 def _log_parts(model: Model, config: dict) -> None:
