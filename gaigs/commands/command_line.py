@@ -113,12 +113,9 @@ def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
 
 
 def note_task(words: list[str], config: dict) -> None:
-    """Logs a warning if the experiment is meant for another task than the labels'.
+    """Logs a warning if ``words`` of the command line choose an experiment of another task.
 
     The name of an experiment holds the name of its task, such as ``csi`` in ``mirrored_csi``.
-
-    Args:
-        words: Words of the command line.
     """
     components = [config.get(key) for key in ("task", "data")]
     if not all(isinstance(component, dict) and "name" in component for component in components):
@@ -163,9 +160,8 @@ def wrong_flag() -> str | None:
 def compose_and_run() -> None:
     """Lets Hydra read the command line and run its jobs.
 
-    An error that a user can correct is printed as one message. The process then ends with code 1,
-    with 2 for an unknown flag, and with 141 if nobody reads its output. ``HYDRA_FULL_ERROR=1``
-    raises errors instead.
+    An error ends the process with code 1, after one message if a user can correct it. An unknown
+    flag gives code 2, a closed output 141. ``HYDRA_FULL_ERROR=1`` raises errors instead.
     """
     if message := wrong_flag():
         print(f"gaigs: {message}", file=sys.stderr)
@@ -193,10 +189,9 @@ def compose_and_run() -> None:
 
 
 def main() -> None:
-    """The console script ``gaigs``: runs the command line, and handles signals.
+    """The console script ``gaigs``: jobs, signals, and at the end the tables of a multirun.
 
-    SIGTERM and SIGHUP end jobs as Ctrl-C does. A signal ends the process with code 128 plus its
-    number, as in shells. The tables of a multirun are written at the end.
+    A signal ends the process with code 128 plus its number, as in shells.
     """
     # Matplotlib reports the making of its font cache.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)

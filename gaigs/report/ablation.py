@@ -94,9 +94,7 @@ def _p_value(metrics: Mapping) -> float | None:
 def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
     """Rows of a run's baselines, without ``<model>_trend``, the model before its kriging.
 
-    Args:
-        metrics: The run's metrics; None for an unfinished run, which has no rows.
-        has_split: True for a column with the split.
+    An unfinished run (None) has no rows. ``has_split`` adds a column with the split.
     """
     if metrics is None:
         return []
@@ -220,9 +218,7 @@ def _speed(
 ) -> Figure:
     """A figure of the first metric of each finished run over its times of training and inference.
 
-    Args:
-        rows: Rows of all runs, then of the baselines.
-        titles: Titles of the columns by name, the first metric first.
+    ``rows`` are those of all runs, then of baselines. The first of the ``titles`` is the metric's.
     """
     metric = next(iter(titles))
     ended = [run for run in runs if run.metrics is not None]
@@ -255,10 +251,7 @@ def _text(value: float | int | str | Spread | None, separator: str) -> str:
 
 
 def _without_errors(row: Mapping) -> dict:
-    """A row without columns of standard errors.
-
-    The cell of a coverage has its standard error after the value, such as "0.902 ± 0.013".
-    """
+    """A row with standard errors only in cells of coverages, such as "0.902 ± 0.013"."""
     shown = {key: value for key, value in row.items() if not key.endswith("_error")}
     for key in row.keys() & {"coverage_50", "coverage_90"}:
         error = row.get(f"{key}_error")

@@ -73,11 +73,9 @@ def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
 
 
 def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude and phase over frequency, a row of panels for each link.
+    """Magnitude and phase of channels over frequency [Hz], a row of panels for each link.
 
-    Args:
-        shown: Labels and predictions; each is drawn at the label's strongest element.
-        frequencies: Subcarriers in any order [Hz].
+    Each channel is drawn at the label's strongest element.
     """
     order = np.argsort(frequencies)
     frequencies = frequencies[order]
@@ -121,13 +119,9 @@ def front_ends(
 ) -> Figure:
     """Level and phase of receivers' front ends over frequency, a line for each element.
 
-    Bands show plus and minus one standard error. Receivers without a response have no row.
-
-    Args:
-        responses: Complex gain of each receiver, element and subcarrier.
-        errors: Standard errors of the responses; 0 for elements that an array lacks.
-        frequencies: Subcarriers [Hz].
-        names: Names of the receivers.
+    Bands show plus and minus one standard error. Receivers without a response have no row. The
+    ``responses`` are complex gains; ``errors``, their standard errors, are 0 for elements that an
+    array lacks.
     """
     rows = [number for number, error in enumerate(errors) if error.any()]
     order = np.argsort(frequencies)

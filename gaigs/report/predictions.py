@@ -57,9 +57,10 @@ def read_examples(file: Path, kind: str) -> Examples:
     """
     scores = next(iter(own_scores(file, kind).values()))
     order = np.argsort(scores)
-    names = {}
-    for name, rank in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9)):
-        names[int(order[round(rank * (len(order) - 1))])] = name
+    names = {}  # by the number of the sample; of few samples one may have two ranks
+    for name, fraction in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9)):
+        rank = round(fraction * (len(order) - 1))
+        names[int(order[rank])] = name
     shown = [*names]
     with np.load(file) as run:
         labels = run["labels"][shown]

@@ -54,11 +54,11 @@ def find_systems(
     for row in baselines:
         model = row["model"]
         scores = {key: [value] for key, value in row.items() if isinstance(value, float)}
-        known = values.get(model, {})
-        common = known.keys() & scores.keys()
-        # As printed: a baseline that is a system, too, has one row.
-        alike = [written(known[key][0]) == written(scores[key][0]) for key in common]
-        if not (known and all(alike)):
+        system_scores = values.get(model, {})
+        common = system_scores.keys() & scores.keys()
+        # A baseline that is a system, too, has one row if all scores are printed alike.
+        alike = [written(system_scores[key][0]) == written(scores[key][0]) for key in common]
+        if not (system_scores and all(alike)):
             name = as_baseline(model) if model in values else model
             title = " ".join(filter(None, (name, row.get("split"))))
             systems.append(System(model, title, [], scores))
@@ -68,7 +68,8 @@ def find_systems(
 def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
     """The row of runs that differ only in the seed; its name omits ``shared`` settings."""
     overrides = group[0].overrides
-    # Of a seed that was run twice, in two multiruns, the first run counts: it is stored last.
+    # If a seed was run twice, in two multiruns, the first run counts: in the reversed order it
+    # replaces the later one.
     ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
     runs = [ended[seed] for seed in sorted(ended)]
     model = overrides.get("model")
@@ -184,7 +185,7 @@ def write_systems(
     published_costs = published["costs"].get(task, [])
     scores = _cells(systems, published_scores, titles)
     costs = _cells(systems, published_costs, COSTS)
-    rows = [ours | theirs for ours, theirs in zip(scores, costs, strict=True)]
+    rows = [row | row_costs for row, row_costs in zip(scores, costs, strict=True)]
 
     heads = [{"system": system.name, "model": system.model} for system in systems]
     lines = [head | row for head, row in zip(heads, rows, strict=True)]
@@ -283,7 +284,9 @@ def _have_same_labels(files: Sequence[Path]) -> bool:
 def _baseline_scores(
     runs: Mapping[str, Run], drawn: Sequence[str], metric: str
 ) -> dict[str, float]:
-    """Validation scores of the baselines by name, without models that have a curve.
+    """Validation scores of the baselines by name, from the first run that has any.
+
+    Models that have a curve are left out.
 
     Args:
         drawn: Names of the systems with a curve.

@@ -64,26 +64,27 @@ def columns_of(rows: Iterable[Mapping]) -> list[str]:
 def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) -> None:
     """Writes rows as a CSV table; the columns are the keys of all rows.
 
+    A column with a ``Spread`` has its mean; further columns have its deviation and lowest value.
+
     Args:
-        endings: Suffixes of the columns for deviation and lowest value of a ``Spread``; they follow
-            its mean. One suffix means the deviation only.
+        endings: Ends of the names of these further columns. One end means the deviation only.
     """
-    spread = set()
+    spread_columns = set()
     for row in rows:
-        spread |= {column for column, value in row.items() if isinstance(value, Spread)}
+        spread_columns |= {column for column, value in row.items() if isinstance(value, Spread)}
     columns = []
     for column in columns_of(rows):
         columns.append(column)
-        if column in spread:
+        if column in spread_columns:
             columns += [f"{column}{ending}" for ending in endings]
     lines = [columns]
     for row in rows:
         cells = dict(row)
-        for column in row.keys() & spread:
+        for column in row.keys() & spread_columns:
             if isinstance(row[column], Spread):
-                mean, *others = row[column]
+                mean, *further = row[column]
                 cells[column] = mean
-                for ending, number in zip(endings, others, strict=False):
+                for ending, number in zip(endings, further, strict=False):
                     cells[f"{column}{ending}"] = number
         lines.append([cells.get(column, "") for column in columns])
     tables.write_table(file, lines)

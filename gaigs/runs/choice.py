@@ -187,12 +187,9 @@ def _options(
 
 
 def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dict:
-    """The configuration of a candidate, with the changes of the ``model=auto`` run.
+    """The preset ``made`` of a candidate with the options that the ``model=auto`` run has changed.
 
-    Args:
-        made: The candidate's preset; it is changed in place.
-        config: Configuration of the ``model=auto`` run.
-        changes: Keys in which ``config`` differs from its preset.
+    ``changes`` are the keys in which the run's ``config`` differs from its own preset.
     """
     changeable = ("loss", "training", "trainer", "ensemble", "seed")  # all trained models have them
     copied = ("data", "split", "save_every", "tensorboard", "figures")
@@ -266,10 +263,8 @@ def _scored(
 ) -> Tried:
     """A candidate with its predictions and their mean score in each group (``Tried.gains``).
 
-    Args:
-        asked: Numbers of the predicted links.
-        values: Predictions (k, *shape).
-        groups: Number of each link's group, within which errors are correlated; None: its place.
+    ``values`` are the predictions (k, *shape) of the links ``asked``. Errors within a group, by
+    default a place, are correlated.
     """
     task = links.task
     scores = task.scores(_labels(links, asked), values)[task.monitor].double()
@@ -302,10 +297,7 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
     asked: Any = unbeaten[0].asked
     for candidate in unbeaten:
         asked = asked[torch.isin(asked, candidate.asked)]
-    values: list[Any] = []  # (k, *shape) of each candidate
-    for candidate in unbeaten:
-        is_asked = torch.isin(candidate.asked, asked)  # type: ignore[arg-type]
-        values.append(candidate.values[is_asked])  # type: ignore[index]
+    values: Any = [one.values[torch.isin(one.asked, asked)] for one in unbeaten]  # type: ignore
     places = links.query[asked].place_keys
     folds = folds_of(links, asked)
     weights, fold_weights = stack(_labels(links, asked), values, places, folds)
@@ -337,11 +329,7 @@ def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
 
 
 def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
-    """Weighted mean of the predictions (k, *shape) of c models.
-
-    Args:
-        shares: Weight of each model (c,), or of each model at each link (c, k).
-    """
+    """Mean of the predictions (k, *shape) of c models by weights (c,), or by link (c, k)."""
     total: Any = 0.0
     for predictions, share in zip(values, torch.as_tensor(shares), strict=True):
         label_axes = [1] * (predictions.ndim - 1)
@@ -368,10 +356,9 @@ def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenMode
     means = gains.mean(1)
     best = int(means.nan_to_num(-math.inf, -math.inf).argmax())
     leads = gains[:, None] - gains  # (c, c, places), of the first candidate over the second
+    standard_errors = 0 * leads.mean(2)  # one place has no scatter: the best candidate is taken
     if len(shared) > 1:
         standard_errors = leads.std(2) / len(shared) ** 0.5
-    else:  # one place has no scatter: the best candidate is taken
-        standard_errors = 0 * leads.mean(2)
     is_beaten = (leads.mean(2) > standard_errors).any(0) | ~means.isfinite()  # (c,)
     chosen = int(is_beaten.int().argmin())  # the first that is not beaten
     level = [tried[number] for number in range(len(tried)) if not is_beaten[number]]

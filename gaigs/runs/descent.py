@@ -205,11 +205,7 @@ def _run(
 
 
 def _log_speed(trainer: lightning.Trainer, budget: Budget, batch_places: int) -> None:
-    """Logs the rate of steps, and whether the time limit of the run ended the training early.
-
-    Args:
-        batch_places: Number of places in a batch.
-    """
+    """Logs the rate of steps, and whether the time limit of the run ended the training early."""
     seconds = budget.seconds - budget.searched
     steps = trainer.global_step
     words = "trained %d steps of %d places in %.0f s: %.1f steps/s"

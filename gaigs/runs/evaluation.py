@@ -56,12 +56,7 @@ Scores = dict[str, dict[str, Tensor]]
 def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> dict[str, Model]:
     """The baselines of a run by name, not yet fitted, without the run's model.
 
-    Args:
-        configurations: Names or configurations of the baselines.
-        model_name: Name of the run's model.
-
-    Raises:
-        ValueError: A baseline has no name, is named twice, or has to be trained.
+    Raises a ``ValueError`` for a baseline that has no name, is named twice or has to be trained.
     """
     models: dict[str, Model | None] = {}
     for config in configurations:
@@ -378,13 +373,9 @@ class LinkScores:
         deviations: Tensor,
         is_main: bool,
     ) -> None:
-        """Scores the intervals of a model.
+        """Scores the intervals of a model; calibrated deviations of the main model are stored.
 
-        Args:
-            key: Name of the model.
-            values: Predictions of the test links (k, *shape).
-            deviations: Standard deviations before calibration.
-            is_main: True for the run's model, whose calibrated deviations are stored.
+        ``deviations`` are standard deviations of the predictions ``values`` before calibration.
         """
         if is_main:
             blocks = []
@@ -411,10 +402,7 @@ def validate(
     """Scores of the validation links, by models and by look-ups fitted without these links.
 
     The result is empty without validation links. Of many validation links a random part is scored.
-
-    Args:
-        models: Models that have not learnt from validation links, by name.
-        look_ups, fits: As for ``score``.
+    ``models`` have not learnt from validation links; other arguments are as for ``score``.
     """
     if not len(links.split.validation):
         return {}

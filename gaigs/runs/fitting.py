@@ -113,11 +113,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
 
 
 def _checked(model: Model | None, links: Links, config: dict) -> Model:
-    """The model, or one built by the configuration if it is None.
-
-    Raises:
-        ValueError: The configuration cannot train the model on these links.
-    """
+    """The model, built if it is None; a ``ValueError`` if it cannot be trained on these links."""
     if config["ensemble"] < 1:
         raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     if model is None:

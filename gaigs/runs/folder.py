@@ -123,9 +123,7 @@ def is_configuration(file: Path) -> bool:
 def check_same_links(stored: dict, current: dict, path: Path) -> None:
     """Raises a ``ValueError`` unless a resumed training has its original links and split.
 
-    Args:
-        stored, current: Split, scene and ``fingerprint`` of the links, of the checkpoint ``path``
-            and of the resumed run.
+    ``stored`` comes from the checkpoint ``path``, ``current`` from the resumed run.
     """
     parts = ("train", "validation", "test")
     has_split = all(torch.equal(stored["split"][part], current["split"][part]) for part in parts)

@@ -123,11 +123,7 @@ def _distance(bounds: tuple[float, float]) -> str:
 
 
 def _separation(bounds: tuple[int, float]) -> str:
-    """The label of a column of separations.
-
-    Args:
-        bounds: Smallest and largest separation [measurements]; infinite in the last column.
-    """
+    """The label of a column; the largest separation is infinite in the last column."""
     low, high = bounds
     if math.isinf(high):
         return f"over {low - 1:,}" if low else "any"

@@ -35,8 +35,6 @@ from gaigs.registry import name_of
 def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
     """Writes the planes and obstacles that a model, or an ensemble's first member, has learnt.
 
-    Returns the files.
-
     Args:
         file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a
             folder beside it.
@@ -117,11 +115,7 @@ def traced_gains(model: MirroredSplatting, gain: float) -> Complex[Tensor, " rec
 
 
 def _gain_comments(model: MirroredSplatting, gain: float) -> list[str]:
-    """Comments of a scene: the factor that turns traced channels into each receiver's channels.
-
-    Args:
-        gain: See ``traced_gains``.
-    """
+    """Comments of a scene: the factor that turns traced channels into each receiver's channels."""
     # Labels in which phases have the other sign than in Sionna RT.
     conjugated = ", then conjugated" if model.pooling.array_sign > 0 else ""
     factors = traced_gains(model, gain).tolist()

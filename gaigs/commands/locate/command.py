@@ -66,12 +66,8 @@ def locate_test(
 
     Writes ``locate.json``, ``locate.csv`` and ``locate.png`` into the folder, and prints errors.
 
-    Args:
-        options: The options of ``locate`` but its model, value, links and region.
-        map_seconds: Time in which ``prints`` was made [s].
-
-    Raises:
-        ValueError: The run has no test links at the carrier of ``prints``.
+    ``map_seconds`` is the time in which ``prints`` was made [s]. A ``ValueError`` is raised without
+    test links at its carrier.
     """
     test = at_carrier(links, prints.frequency, "test")
     if not len(test):

@@ -16,12 +16,8 @@ from gaigs.core.query import ROUNDING, evenly
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
     """Axes (columns of the result) along which the errors of a label's m values are independent.
 
-    Squared errors of a label along these axes sum to 1 on average. Errors without any variation
-    give the m unit vectors.
-
-    Args:
-        errors: Errors of n labels.
-        most: Largest number of labels used, at even steps.
+    Squared errors of a label along these axes sum to 1 on average. At most ``most`` labels are
+    used, at even steps. If all errors are 0, the axes are unit vectors.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.
