@@ -66,7 +66,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def describe_job(settings: DictConfig, command: str | None) -> Job:
-    """The job that Hydra's settings and the name of the command describe."""
+    """Facts of the running job, from Hydra's settings and the name of the command."""
     is_sweep = settings.mode is RunMode.MULTIRUN
     mode = "sweep" if is_sweep else "run"
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"

@@ -88,7 +88,7 @@ class Levels:
 
     @classmethod
     def of(cls, links: Links, most: int = 2000) -> "Levels":
-        """Levels of all links; for arrays of up to ``most`` links, evenly spread."""
+        """Levels of all scalar links, or of at most ``most`` evenly spread links with arrays."""
         task = links.task
         index = torch.arange(len(links))
         title = with_unit(task.quantity, task.unit)
@@ -102,7 +102,7 @@ class Levels:
 
 
 def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """The mean over each label of ``index``; for channels the mean power [dB]."""
+    """Mean of each label of the links ``index``, or the mean power [dB] if it is a channel."""
     labels = links.labels[index].reshape(len(index), -1)
     if not labels.is_complex():
         return labels.double().mean(1)
@@ -117,7 +117,7 @@ def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
 
 
 def extent_lines(links: Links, levels: Levels) -> list[str]:
-    """Numbers of links and places, ranges of places and levels, parts of the split, repetitions."""
+    """Lines on links, places, levels, the split and repeated links, for ``Description.read``."""
     places = links.query.transmitters.unique(dim=0)
     axes = zip("xyz", places.amin(0).tolist(), places.amax(0).tolist(), strict=True)
     ranges = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in axes)

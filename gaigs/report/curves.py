@@ -40,7 +40,7 @@ def cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> Figure:
-    """A figure of ``draw_cdf``, with a legend, and the name of the split at the bottom."""
+    """A figure of the cumulative distribution of a score, see ``draw_cdf``, with a legend."""
     with rc_context(STYLE):
         figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
@@ -171,7 +171,7 @@ def _score_title(name: str) -> str:
 
 
 def _of_group(curves: Mapping[str, Curve], group: str) -> dict[str, Curve]:
-    """Curves of a group by their names without ``<group>/``; the loss comes first."""
+    """Curves whose names start with ``<group>/``, by the rest of the name, the loss first."""
     start = f"{group}/"
     names = [name.removeprefix(start) for name in curves if name.startswith(start)]
     names.sort(key=lambda name: name != "loss")

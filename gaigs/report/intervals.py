@@ -59,7 +59,7 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
 
 
 def _magnitudes(numbers: Shaped[ndarray, "..."]) -> Float[ndarray, "k numbers"]:
-    """Magnitudes of the numbers of each of k labels."""
+    """Absolute values of k labels of any shape, one row for each label."""
     return np.abs(numbers).astype(float).reshape(len(numbers), -1)
 
 

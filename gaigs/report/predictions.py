@@ -42,7 +42,7 @@ def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray
 
 
 class Examples(NamedTuple):
-    """Test samples for a figure."""
+    """Labels, predictions and scores of some test links, for a figure."""
 
     labels: ndarray  # labels (k, *shape)
     predictions: ndarray  # predictions, likewise

@@ -54,7 +54,7 @@ def map_pages(
 
 
 def deviation_map(radio_map: RadioMap) -> RadioMap:
-    """The standard deviations as a map."""
+    """A map of the standard deviations of a map's values."""
     if radio_map.deviations is None:
         raise ValueError(
             "the map has no deviations, as the model has no intervals\n"
@@ -305,7 +305,7 @@ def _scale(
 
 
 def _levels(values: Float[ndarray, "rows columns"], scale: _Scale) -> Float[ndarray, " k"]:
-    """Levels of contours within a map's range, at most 20 beyond each end of the scale."""
+    """Values of a map's contour lines: in its range, at most 20 beyond each end of the scale."""
     lowest = max(values.min(), scale.low - 20 * scale.step)
     highest = min(values.max(), scale.high + 20 * scale.step)
     first = np.floor(lowest / scale.step)

@@ -258,7 +258,7 @@ def _draw_links(view: _View, links: Links, arrow: float) -> None:
 
 
 def _rims(corners: Float[ndarray, "k 3"]) -> tuple[Float[ndarray, "2 3"], float]:
-    """A box around points with margins, and the length of arrows in it [m]."""
+    """A box around points with margins [m], and the length of arrows in a drawing of it [m]."""
     ends = np.stack((corners.min(0), corners.max(0)))
     arrow = 0.1 * float(np.ptp(ends, 0).max())
     return ends + 1.2 * arrow * np.array([[-1], [1]]), arrow

@@ -218,7 +218,7 @@ def _compared(config: Mapping) -> dict:
 
 
 def _failure(folder: Path) -> str | None:
-    """The last line of a job's log, if it is the final error of the job."""
+    """The error that ended a job, from the last line of its log; None if it is no error."""
     logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
     last = "".join(log.read_text(errors="replace") for log in logs).rstrip().rpartition("\n")[2]
     return last.removeprefix("gaigs: ") if last.startswith("gaigs: ") else None

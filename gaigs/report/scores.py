@@ -118,7 +118,7 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: in
 def _texts(
     models: Mapping[str, Mapping], name: str, metric: Metric, bold: str = "[bold]{}[/bold]"
 ) -> dict[str, str]:
-    """One metric as text by model, the best value in the format ``bold``."""
+    """The values of one metric as text, by model; the best has the format ``bold``."""
     values = [scores[name] for scores in models.values()]
     return dict(zip(models, best_in_bold(values, metric.higher_is_better, bold), strict=True))
 

@@ -135,7 +135,7 @@ def pixel_edges(
 
 
 def _colours(limit: float | None) -> dict[str, Any]:
-    """Colours for amplitudes; with a limit, for signed errors up to it."""
+    """Colours for amplitudes from 0 to 1, or for signed errors up to the limit if it is given."""
     if limit is None:
         return {"cmap": "viridis", "vmin": 0, "vmax": 1}
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}

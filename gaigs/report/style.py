@@ -71,7 +71,7 @@ LINES = [_line(number) for number in range(36)]
 
 
 def _marker(number: int) -> dict:
-    """Look of a point; every five points the shape changes."""
+    """Matplotlib's options for a point by its number; every five points the shape changes."""
     colour = (BLUE, ORANGE, GREEN, PURPLE, SKY)[number % 5]
     edge = {"markeredgecolor": "white", "markeredgewidth": 0.5}
     return {"marker": "os^Dv"[number // 5], "color": colour} | edge
@@ -146,7 +146,7 @@ def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
 
 
 def even_pages(items: Sequence, most: int) -> list[Sequence]:
-    """Items of each page, at most ``most``, with nearly equal numbers."""
+    """Items in pages of nearly equal numbers, at most ``most`` a page."""
     pages = math.ceil(len(items) / most) or 1
     size = math.ceil(len(items) / pages) or 1
     return [items[first : first + size] for first in range(0, len(items), size)]

@@ -26,7 +26,7 @@ from gaigs.report.training_log import read_validations
 
 
 class System(NamedTuple):
-    """A row of the table."""
+    """A row of the table of systems: runs that differ only in the seed, or a baseline."""
 
     model: str  # registered name
     name: str  # name in tables and figures
@@ -192,9 +192,9 @@ def write_systems(
     write_csv(folder / "systems.csv", lines, (", sd",))
     names = [system.name for system in systems]
     page = ""
-    for part in (scores, costs):
-        cells = _lines(names, part, metrics, bold="**{}**")
-        page += f"{markdown([['system', *part[0]], *cells])}\n"
+    for table in (scores, costs):
+        cells = _lines(names, table, metrics, bold="**{}**")
+        page += f"{markdown([['system', *table[0]], *cells])}\n"
     page += ", ".join(f"{key}={value}" for key, value in shared.items()) + "\n"
     for column in (*published_scores, *published_costs):
         page += f"- published {column['title']}: {column['source']}\n"
@@ -202,14 +202,14 @@ def write_systems(
     write_text(folder / "systems.md", page)
     for name, figure in _figures(done, task, metrics).items():
         save(figure, folder / f"systems_{name}.png")
-    brief = _brief(scores[0], costs[0], metrics)
-    shown = []
+    terminal_titles = _brief(scores[0], costs[0], metrics)  # a terminal has less room
+    terminal_rows = []
     for row in rows:
-        shown.append({title: row[title] for title in brief})
-    cells = _lines([escape(name) for name in names], shown, metrics)
+        terminal_rows.append({title: row[title] for title in terminal_titles})
+    cells = _lines([escape(name) for name in names], terminal_rows, metrics)
     caption = "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md"
     styles = [None if system.runs else "dim" for system in systems]
-    heads = {"system": False} | dict.fromkeys(brief, True)
+    heads = {"system": False} | dict.fromkeys(terminal_titles, True)  # True for numbers
     return terminal("Systems", heads, cells, caption, styles)
 
 
@@ -226,10 +226,10 @@ def _brief(scores: Mapping, costs: Mapping, metrics: Mapping[str, Metric]) -> li
 def _figures(
     systems: Sequence[System], task: str, metrics: Mapping[str, Metric]
 ) -> dict[str, Figure]:
-    """Figures of the first seed that all systems have, if they share the split.
+    """Figures that compare one run of each system, by name; none if the splits differ.
 
-    The task's figures need the same test links. Figures of validation scores over time need a log
-    of time.
+    The task's figures are drawn if all runs have the same test links. Validation scores over time
+    are drawn for runs whose log has times.
     """
     runs = _first_seeds(systems)
     splits = {run.metrics["split"] for run in runs.values()}
@@ -256,7 +256,7 @@ def _figures(
 
 
 def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
-    """A run of each system by name: with the lowest common seed, or else its first run."""
+    """One run of each system by name: of the lowest seed of all systems, or else the first."""
     counts: Counter[int] = Counter()
     for system in systems:
         counts.update({run.metrics["seed"] for run in system.runs})

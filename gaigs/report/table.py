@@ -14,7 +14,7 @@ from gaigs.io import tables
 
 
 class Spread(NamedTuple):
-    """A score of at least two runs."""
+    """Mean, standard deviation and lowest value of a score over at least two runs."""
 
     mean: float
     deviation: float  # standard deviation of the sample
@@ -42,7 +42,7 @@ def best_in_bold(
     higher_is_better: bool,
     bold: str = "[bold]{}[/bold]",
 ) -> list[str]:
-    """A column as text; the best printed value has the format ``bold``, also if repeated."""
+    """A column as text; all cells that print like the best value have the format ``bold``."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     best = (max if higher_is_better else min)(known, default=None)
@@ -128,7 +128,7 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
 
 
 def tex(text: str) -> str:
-    """Plain text in LaTeX."""
+    """Plain text with its special characters in LaTeX."""
     signs = {sign: f"\\{sign}" for sign in "&%$#_{}"}
     signs |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     signs |= {"±": r"$\pm$", "²": "$^2$", "−": "$-$", "×": r"$\times$"}

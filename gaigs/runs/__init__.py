@@ -222,7 +222,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
 
 
 def _draw(folder: Path, links: Links, model: Model) -> None:
-    """Writes the radio map and the figures."""
+    """Writes the radio map of scalar labels, and all figures, into the run folder."""
     if links.task.is_scalar:
         with timed("radio map"):
             radio_map(model).save(folder / "radio_map.npz")

@@ -59,7 +59,7 @@ class Tried(NamedTuple):
 
 
 class ChosenModel(NamedTuple):
-    """The chosen candidate, and a sentence with the reason."""
+    """The chosen candidate, and the reason as a sentence."""
 
     chosen: Tried
     reason: str
@@ -379,7 +379,7 @@ def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenMode
 
 
 def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> dict:
-    """Entry of ``metrics.json`` on the choice."""
+    """The entry ``auto`` of ``metrics.json``: the chosen model, the reason, and all scores."""
     sign = 1 if task.higher_is_better else -1  # gains are negative if lower scores are better
     candidates = {}
     for candidate in tried:
@@ -407,7 +407,8 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
     """The result of the chosen candidate's run, or the blend of several candidates.
 
-    The folder gets its checkpoint and log. A look-up is fitted to all known links.
+    The run folder gets the checkpoint, and of a single candidate also the log. A look-up is fitted
+    to all known links.
     """
     candidates = chosen.members or (chosen,)
     results = []

@@ -111,7 +111,7 @@ def _identity(links: Links, config: dict) -> dict:
 
 
 def _callbacks(module: Any, links: Links, config: dict) -> list[Callback]:
-    """Callbacks between the steps: density control, revisions, progress line; if configured."""
+    """Configured callbacks of a training: density control, revisions and the progress line."""
     callbacks: list[Callback] = []
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))

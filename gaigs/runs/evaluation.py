@@ -122,7 +122,7 @@ class Evaluation(JupyterMixin):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The entries of a ``metrics.json`` for tables."""
+        """Entries as in a ``metrics.json``, from which tables are made."""
         facts = {"task": self.task.name, "split": self.split, "device": self.device}
         return facts | {"models": self.models, "paired": self.paired and self.paired._asdict()}
 
@@ -312,7 +312,7 @@ def score(
 
 
 def _lack(calibration: Calibration | None) -> str:
-    """A text that says what a model lacks for intervals of 90 %."""
+    """What a model lacks for intervals of 90 %, for a warning."""
     count = 0 if calibration is None else int(calibration.counts.min())
     if count >= fewest(0.9):
         return "at new receivers three others with links must calibrate them"
@@ -359,7 +359,7 @@ class LinkScores:
             self.content["azimuths"] = self.task.directions.azimuths.numpy()
 
     def add(self, key: str, values: Tensor) -> None:
-        """Scores predictions of a model."""
+        """Scores predictions of the model ``key``, and stores them if it is the first model."""
         self.scores[key] = self.task.scores(self.labels, values)
         self.content.setdefault("prediction", self.task.packed(values))
         stored = self.task.stored(self.labels, values, self.scores[key])
@@ -413,7 +413,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """Metrics of the table for each receiver with test links, by receiver and model."""
+    """Metrics by receiver and model, for receivers with test links."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 
 class Fitted(NamedTuple):
-    """Result of ``fit``."""
+    """Models of a run after their training, with durations; the result of ``fit``."""
 
     # The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
     models: dict[str, Model]
@@ -43,10 +43,10 @@ class Fitted(NamedTuple):
 
 
 class Start(NamedTuple):
-    """A model trained from the better of its starts."""
+    """The better of a model's trainings from two starts."""
 
     model: Model
-    config: dict  # which builds it
+    config: dict  # configuration of the run with this start
     seconds: float  # duration of the second training
 
 

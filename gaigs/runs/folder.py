@@ -70,7 +70,7 @@ def software(config: dict) -> dict[str, str]:
 
 
 def stored_software(folder: Path) -> dict[str, str]:
-    """``software`` at the start of a run; empty if unknown."""
+    """Versions and digests stored at the start of a run, as of ``software``; empty if unknown."""
     try:
         return json.loads((folder / "software.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

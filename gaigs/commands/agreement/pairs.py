@@ -151,7 +151,7 @@ def measure(
 
 
 def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray, " rows"]:
-    """Upper edges of the rows of distances [m], from the spacing of places to their extent."""
+    """Upper edges [m] of the rows of a table by distance, up to the extent of the places."""
     extent = float(np.linalg.norm(np.ptp(places, 0)))
     spacing = median_spacing(links.query.transmitters.unique(dim=0))
     edges = [np.nextafter(0, 1), round_step(spacing, 1)]  # 1, 2 or 5 times a power of ten
@@ -275,7 +275,7 @@ def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]
 
 
 def joined_scores(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Scores of several parts by name, joined."""
+    """Scores by name, each joined over several sets of scores."""
     scores = {}
     for name in parts[0]:
         scores[name] = torch.cat([part[name] for part in parts])

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Labels(NamedTuple):
-    """The links to predict, and their test labels."""
+    """Links to predict, with their test labels if known."""
 
     query: Query
     task: Task  # task of the values; of held-out subcarriers their own
@@ -228,5 +228,5 @@ def _rows(
 
 
 def _shown(value: Any, digits: int = 7) -> str:
-    """A text unchanged, or a number with ``digits`` digits."""
+    """A cell of the table: a text unchanged, or a number with ``digits`` significant digits."""
     return value if isinstance(value, str) else f"{value:.{digits}g}"

@@ -71,7 +71,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 
 
 def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
-    """The carrier of a scene's materials [Hz]; a ``ValueError`` if option and data lack one."""
+    """The option ``frequency``, or else the data's carrier [Hz]; a ``ValueError`` without one."""
     if frequency is None:
         frequency = mirrored.scene.middle_frequency
     if frequency is None:

@@ -68,7 +68,7 @@ def write_scenario(
 def _fields(
     model: MirroredSplatting, query: Query, receiver: int, carrier: float
 ) -> Complex[ndarray, "users paths"]:
-    """Gains of the paths from users to a receiver at the carrier [Hz]; 0 for no path."""
+    """Complex gains of paths from users to a receiver at the carrier [Hz]; 0 without a path."""
     amplitudes = []
     for batch in query.parts(64):
         batch = batch.to(model.placement.middle.device)

@@ -20,7 +20,7 @@ from gaigs.report import style
 
 
 class Cells(NamedTuple):
-    """Cells of a map."""
+    """Square cells of a map from above, and places to count in them."""
 
     # Their edges [m].
     x: Float[ndarray, " columns1"]

@@ -137,7 +137,7 @@ def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
 def receptions(
     links: Links, index: Int[Tensor, " k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
-    """Places of n transmissions [m], and 1 for each receiver with a link, otherwise 0."""
+    """Places of n transmissions [m], and for each receiver 1 if it has a link ``index``, else 0."""
     rows, transmission_of_link = rows_of(links)[index].unique(return_inverse=True)
     places = torch.zeros(len(rows), 3)
     places[transmission_of_link] = links.query.transmitters[index]

@@ -45,7 +45,7 @@ def neighbours(
     distances = distances.masked_fill(is_same_group, torch.inf)
 
     def mean_error(count: int) -> float:
-        """Mean error [m] of the chosen known transmissions with ``count`` neighbours."""
+        """Mean error [m] of the chosen known transmissions, located by ``count`` neighbours."""
         located = weighted_mean(distances, places, count)
         return (located - places[chosen]).norm(dim=1).mean().item()
 

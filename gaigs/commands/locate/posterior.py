@@ -120,7 +120,7 @@ def posterior(
     step: float | None,
     level: float,
 ) -> Location:
-    """The location of fingerprints ``values``, by the options of ``locate``.
+    """Places and regions of transmissions from their fingerprints, by the options of ``locate``.
 
     Each of the n transmissions has m values at each receiver, from ``Task.fingerprint``.
 

@@ -97,7 +97,7 @@ def fingerprints(
 
 
 def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
-    """Corners of a region [m]; without a region, of the box of the training transmitters."""
+    """Corners of the region [m], or of the box of the training transmitters if it is None."""
     if region is None:
         return torch.stack((model.scene.lower, model.scene.upper))
     box = as_positions("region", region).reshape(-1, 3)
@@ -116,7 +116,7 @@ def affordable_points(
     fewest: int = 1000,
     seconds: float = 60.0,
 ) -> int:
-    """Number of candidate places that a model predicts in ``seconds``, in given limits."""
+    """Number of places that a model predicts in ``seconds``, from ``fewest`` to ``most``."""
     places = even_places(box[0], box[1], 512)
     predicted(model, places[:2], frequency)  # the first prediction compiles and loads
     start = time.perf_counter()
@@ -133,7 +133,7 @@ class Predicted(NamedTuple):
 
 
 def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | None) -> Predicted:
-    """Predictions of a model at places [m] and a carrier [Hz]."""
+    """Fingerprints that a model predicts for transmitters at places [m] and a carrier [Hz]."""
     task = model.scene.task
     count = len(model.scene.receivers)
     batch_size = 8192  # links
@@ -228,7 +228,7 @@ class PrintFold(NamedTuple):
     errors: Float[Tensor, "k r m"]
 
     def half(self, number: int) -> "PrintFold":
-        """Every second fingerprint, starting with the first (0) or the second (1)."""
+        """The fold with every second fingerprint, from the first (0) or the second (1) on."""
         return PrintFold(self.prints, *(part[number::2] for part in self[1:]))
 
 

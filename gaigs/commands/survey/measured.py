@@ -33,7 +33,7 @@ class ReceiverReadings(NamedTuple):
     chances: Float[Tensor, " g"]  # probability that the receiver receives each place
 
     def deviations(self, whitened: Float[Tensor, "n g"]) -> Float[Tensor, " g"]:
-        """Standard deviations of new readings, from ``Process.whitened`` of the known ones."""
+        """Standard deviations of new readings, given the ``Process.whitened`` of known readings."""
         variances = (self.variances - whitened.square().sum(0)).clamp_min(0)
         return (variances + self.process.noise).sqrt()
 

@@ -232,7 +232,7 @@ def survey(
 
 
 class SurveyPlaces(NamedTuple):
-    """Places of a survey."""
+    """Candidates of a survey, and places over which its error is stated."""
 
     candidates: Float[Tensor, "c 3"]  # places that can be measured [m]
     # Places over which the error is stated [m]; if empty, it is stated over the candidates.
@@ -306,7 +306,7 @@ def coordinates_of(
 
 
 def mean_absolute(deviation: float) -> float:
-    """Mean absolute value of a normal variable."""
+    """Mean absolute value of a normal variable with mean 0 and a standard deviation."""
     return math.sqrt(2 / math.pi) * deviation
 
 
@@ -385,7 +385,7 @@ class Selection:
         return self.factor * mean_of_received(deviations, self.chances[:, self.evaluated])
 
     def scatter(self) -> float:
-        """Mean error if the process were known: the noise of a reading alone."""
+        """Mean error by the noise of a reading alone, which no further measurement lowers."""
         noises = self.chances.new_tensor(self.noises)[:, None].sqrt()  # (r, 1)
         chances = self.chances[:, self.evaluated]  # (r, e)
         return self.factor * mean_of_received(noises.expand_as(chances), chances)

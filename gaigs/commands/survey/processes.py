@@ -66,7 +66,7 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
     scale = 2 * variance**0.5  # standard deviation of a and b
 
     def decades(places: Tensor) -> Tensor:
-        """Decimal logarithms of distances to the receiver, from 0.1 m on (n,)."""
+        """Decimal logarithms of distances to the receiver [m], at least 0.1 m (n,)."""
         return (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
 
     middle = decades(process.places).mean() if receiver is not None else 0.0

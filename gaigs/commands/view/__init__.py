@@ -42,7 +42,7 @@ class View:
 
     @cached_property
     def facts(self) -> list[dict]:
-        """Facts of each model that do not depend on the transmitter."""
+        """Axes, units, room and receivers of each model, for any place of the transmitter."""
         return [contents.facts() for contents in self.contents]
 
     def save(self, path: str | Path) -> None:
@@ -164,7 +164,7 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
 
 
 def side_by_side(contents: list[Contents]) -> list[Contents]:
-    """The contents; raises a ``ValueError`` if their receivers differ."""
+    """The given contents; raises a ``ValueError`` if their receivers differ."""
     scene = contents[0].scene
     places = scene.positions(scene.lower)
     names = [receiver.name for receiver in scene.receivers]

@@ -28,7 +28,7 @@ from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 
 class Shown(NamedTuple):
-    """Predictions on the CPU."""
+    """Predictions of a model and their uncertainty, on the CPU."""
 
     value: Tensor
     std: Tensor | None  # their deviations; None if the model states none
@@ -249,7 +249,7 @@ class Contents:
         return {}
 
     def _estimate(self, points: Float[Tensor, "b 3"], receiver: int | None) -> Shown:
-        """Predictions at places [m] for a receiver; None for all."""
+        """Predictions for transmitters at places [m] at one receiver, or at all if it is None."""
         options = {
             "frequency": self.frequency,
             "batch_size": self.points,
@@ -374,7 +374,7 @@ def splats(
     opacities: Float[ndarray, " n"],
     strengths: Float[ndarray, " n"],
 ) -> dict:
-    """Gaussians in the page's form; covariances [m²] by their upper triangles."""
+    """Gaussians as JSON lists of the page; of covariances [m²] only the upper triangles."""
     rows, columns = np.triu_indices(3)
     return {
         "means": plain(means),
@@ -385,7 +385,7 @@ def splats(
 
 
 def loudest(channel: Tensor) -> Tensor:
-    """The element with the most power."""
+    """Number of the element of a channel (elements, subcarriers) with the most power."""
     return channel.abs().square().sum(1).argmax()
 
 
