@@ -195,22 +195,20 @@ def survey(
         selection = Selection([process], everywhere, places, mean_absolute(1.0))
         chosen, _ = selection.choose(count)
         no_places = places.candidates[:0]
-        no_losses = no_places[:, 0]
-        return SurveyPlan(places.candidates[chosen], None, no_places, no_losses, no_losses.bool())
+        losses = no_places[:, 0]
+        return SurveyPlan(places.candidates[chosen], None, no_places, losses, losses.bool())
 
     everywhere = coordinates_of(model, places.all, frequency).to(processes[0].places)
     trend_centres: Sequence = [None] * len(processes)
     if model.scene.task.is_scalar:  # levels fall with the distance from the receiver
         trend_centres = model.scene.positions(everywhere)
-    # Without trends: a trend correlates all places.
     spacing = Spacing(processes, everywhere[: len(places.candidates)])
-    pairs = zip(processes, trend_centres, strict=True)
-    processes = [with_trend(process, centre) for process, centre in pairs]
+    # After the spacing, as a trend correlates all places.
+    processes = [*map(with_trend, processes, trend_centres)]
     factor = error_factor(model)
     selection = Selection(processes, everywhere, places, factor)
     scatter = selection.scatter()
-    # The error never falls below the scatter. At scatter / (1 - stop) it can fall by the fraction
-    # ``stop`` at most.
+    # From scatter / (1 - stop) on, the error can fall by at most the fraction ``stop``.
     chosen, errors = selection.choose(count, spacing, scatter / (1 - stop))
     # Measured places count over the region, or the whole room if there are candidates alone.
     evaluated = everywhere[places.evaluated]
