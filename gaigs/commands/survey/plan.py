@@ -204,12 +204,12 @@ def survey(
         trend_centres = model.scene.positions(everywhere)
     spacing = Spacing(processes, everywhere[: len(places.candidates)])
     # After the spacing, as a trend correlates all places.
-    processes = [*map(with_trend, processes, trend_centres)]
+    pairs = zip(processes, trend_centres, strict=True)
+    processes = [with_trend(process, centre) for process, centre in pairs]
     factor = error_factor(model)
     selection = Selection(processes, everywhere, places, factor)
     scatter = selection.scatter()
-    # From scatter / (1 - stop) on, the error can fall by at most the fraction ``stop``.
-    chosen, errors = selection.choose(count, spacing, scatter / (1 - stop))
+    chosen, errors = selection.choose(count, spacing, enough=scatter / (1 - stop))
     # Measured places count over the region, or the whole room if there are candidates alone.
     evaluated = everywhere[places.evaluated]
     if region is None and candidates is not None:
