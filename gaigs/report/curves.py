@@ -131,8 +131,8 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
     """
     panels = {}
     for group, title in (("train", "loss and its terms"), ("penalty", "penalties, unweighted")):
-        if names := _of_group(curves, group):
-            panels[title] = names
+        if of_group := _of_group(curves, group):
+            panels[title] = of_group
     # Scores have units of their own.
     for name, curve in _of_group(curves, "validation").items():
         panels[f"validation {_score_title(name)}"] = {name: curve}
@@ -143,10 +143,11 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
         axes = [*figure.subplots(rows, columns, squeeze=False).flat]
         for ax in axes[len(panels) :]:
             ax.remove()
-        for ax, (title, names) in zip(axes, panels.items(), strict=False):
-            sizes = {name: float(abs(values).mean()) for name, (_, values) in names.items()}
-            named = named_ones(sizes, True, next(iter(names)))
-            for name, curve in names.items():
+        for ax, (title, curves_here) in zip(axes, panels.items(), strict=False):
+            # The largest terms have a colour and a name.
+            sizes = {name: float(abs(values).mean()) for name, (_, values) in curves_here.items()}
+            named = named_ones(sizes, True, next(iter(curves_here)))
+            for name, curve in curves_here.items():
                 look = OTHERS
                 if name in named:
                     colour, dash = LINES[named.index(name)]
@@ -154,10 +155,10 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
                 _draw_smoothed(ax, *curve, **look)
             ax.set(xlabel="step", title=title)
             ax.grid()
-            if len(names) > 1:
+            if len(curves_here) > 1:
                 ax.legend()
             is_score = title.startswith("validation")
-            if not is_score and any((values > 0).any() for _, values in names.values()):
+            if not is_score and any((values > 0).any() for _, values in curves_here.values()):
                 ax.set_yscale("log")
                 _round_ticks(ax.yaxis, (1, 2, 5))
         ask(figure, "Has the training settled?")

@@ -80,8 +80,9 @@ def _draw_errors(
     colour: str,
     groups: int = 12,
 ) -> int:
-    """Draws root mean square errors of links in groups with similar deviations; returns their
-    number.
+    """Draws root mean square errors of groups of links; returns the number of groups.
+
+    Links of a group have similar deviations.
 
     Args:
         stated: Stated standard deviation of each link.

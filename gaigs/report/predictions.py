@@ -15,14 +15,14 @@ def as_baseline(name: str) -> str:
 
 
 def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` by model, the run's model first."""
+    """Arrays ``<kind>_<model>`` of a ``predictions.npz`` by model, the run's model first."""
     start = f"{kind}_"
     with np.load(file) as run:
         return {key.removeprefix(start): run[key] for key in run.files if key.startswith(start)}
 
 
 def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` of each system's model, then of the first system's baselines.
+    """Scores ``kind`` of each system's model, then of the first system's baselines, by name.
 
     A baseline is left out if a system of the same name has the same scores.
     """

@@ -227,8 +227,8 @@ def plot_radio_map(
         if not deviation and links.split is not None:
             test = links.split.test
             rows = torch.column_stack((links.query.transmitters[test, :2], links.labels[test]))
-            parts = [rows[links.query.receivers[test] == k].numpy() for k in range(len(gateways))]
-            readings = dict(zip(gateways, parts, strict=True))
+            receivers = links.query.receivers[test]
+            readings = {name: rows[receivers == k].numpy() for k, name in enumerate(gateways)}
     if ax is None:
         figures = radio_maps(floor, gateways, readings, edges)
         axes = itertools.chain.from_iterable(figure.axes for figure in figures)

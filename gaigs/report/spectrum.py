@@ -148,7 +148,7 @@ def draw_plane(
     values: Float[ndarray, "rows columns"],
     limit: float | None = None,
 ) -> QuadMesh:
-    """Draws a spectrum over the edges of its pixels [deg]; or errors of at most ``limit``."""
+    """Draws a spectrum, or errors of at most ``limit``, between edges of pixels [deg]."""
     image = ax.pcolormesh(azimuths, elevations, values, rasterized=True, **_colours(limit))
     ax.xaxis.set_major_locator(MultipleLocator(90))
     ax.yaxis.set_major_locator(MultipleLocator(30))

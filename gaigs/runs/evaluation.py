@@ -339,12 +339,12 @@ class LinkScores:
     """
 
     def __init__(self, links: Links):
-        asked = links.held_out or links
+        labelled = links.held_out or links  # held-out subcarriers have their own task and labels
         self.size = batch_size(links)
         self.index = links.split.test
-        self.task: Any = asked.task
+        self.task: Any = labelled.task
         self.query = links.query[self.index]
-        self.labels = torch.cat([asked.labels[part] for part in self.index.split(self.size)])
+        self.labels = torch.cat([labelled.labels[rows] for rows in self.index.split(self.size)])
         self.scores: Scores = {}
         self.content: dict[str, Any] = {
             "link": self.index.numpy(),

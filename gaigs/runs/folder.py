@@ -32,9 +32,9 @@ def claim(folder: Path, config: dict) -> None:
     existing = [name for name in names if (folder / name).exists()]
     if existing and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(existing)} of something else\n{ANOTHER}")
-    trainings = (folder, folder / "second_start", *folder.glob("members/*"))
-    for place in (folder / "figures", *trainings):
-        remove_parts(place)  # a killed run leaves temporary files
+    training_folders = (folder, folder / "second_start", *folder.glob("members/*"))
+    for written in (folder / "figures", *training_folders):
+        remove_parts(written)  # a killed run leaves temporary files
     # Without a checkpoint or scores there is nothing to resume: the run starts from scratch.
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)

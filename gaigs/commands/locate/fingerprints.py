@@ -124,7 +124,7 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
 def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
     """The transmissions of the links ``index``, with the labels of these links only."""
     rows, transmission_of_link = rows_of(links)[index].unique(return_inverse=True)
-    # Blocks, as labels may be read from a file.
+    # ``rows``: numbers of the transmissions. Blocks, as labels may be read from a file.
     blocks = [links.task.fingerprint(links.labels[block]) for block in index.split(256)]
     labels = torch.cat(blocks)  # (k, m)
     values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
