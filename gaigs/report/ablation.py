@@ -244,7 +244,7 @@ def _numbers(rows: Sequence[Mapping], key: str) -> Float[ndarray, " rows"]:
 
 
 def _text(value: float | int | str | Spread | None, separator: str) -> str:
-    """A cell of a table; the lowest value of several seeds follows after a separator."""
+    """A cell of a table; the lowest value of a ``Spread`` follows after a separator."""
     if isinstance(value, Spread):
         return f"{written(value)}{separator}least {written(value.least)}"
     return written(value)

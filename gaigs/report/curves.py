@@ -199,7 +199,8 @@ def speed_against_error(
             name.
         models: Model of each run, for colours; empty for a single colour.
     """
-    times = {label: values for label, values in times.items() if np.isfinite(values).any()} or times
+    known_times = {kind: values for kind, values in times.items() if np.isfinite(values).any()}
+    times = known_times or times
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
     key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
     key_rows = (len(names) + len(baselines) + 1) // key_columns
@@ -282,4 +283,5 @@ def _draw_smoothed(ax: Axes, steps: ndarray, values: ndarray, **line) -> None:
     if len(values) <= 30:
         line["marker"] = "."
     # The mean over a window is drawn at the window's middle.
-    ax.plot(steps[(window - 1) // 2 :][: len(mean)], mean, **line)
+    middle = (window - 1) // 2
+    ax.plot(steps[middle : middle + len(mean)], mean, **line)

@@ -231,7 +231,7 @@ def _figures(
     The task's figures are drawn if all runs have the same test links. Validation scores over time
     are drawn for runs whose log has times.
     """
-    runs = _first_seeds(systems)
+    runs = _first_seeds(systems)  # one for each system
     splits = {run.metrics["split"] for run in runs.values()}
     if len(splits) > 1:
         return {}

@@ -57,11 +57,11 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     model = _checked(model, links, config)
     kriged = _untrained_kriging(model, links, config)
     _log_parts(model, config["model"])
-    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
+    # Parts end at fractions of the run's time limit: the search 0.3, the training 0.5, kriging and
     # intervals 0.8.
     searched, places = _prepare(model, links, name, until=0.3 if model.is_trained else 0.8)
     if is_given:
-        model.second_start = {}  # a better second start would be another object
+        model.second_start = {}  # a given model is trained in place, a second start is not
     start = count_gaussians(model)
     best = folder / "best.ckpt"
     if not model.is_trained:

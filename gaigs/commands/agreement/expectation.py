@@ -58,7 +58,7 @@ def on_split(
             "one label as near: random pairs of the cell that a test link and its nearest known "
             "one are in"
         )
-        # Two noisy labels differ by twice the variance of one label from the mean of many.
+        # With noise of variance s², two labels differ by 2 s² and a label from the mean by s².
         averaged = links.task.averaged(scores)
         if averaged is not None:
             rows["mean of many as near"] = links.task.summarise(averaged)

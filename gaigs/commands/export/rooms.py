@@ -48,8 +48,8 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         frequency = _carrier(mirrored, frequency)
     paths = trace_paths(placement, mirrored.traced)
     planes = outline_planes(placement, paths)
-    # Sheets, thin absorbers, replace obstacles in the box of all paths and planes. The gain is what
-    # they leave to all paths in common [Np].
+    # Sheets, thin absorbers, replace obstacles in the box of all paths and planes. ``gain`` is the
+    # common gain of all paths that sheets do not explain [Np].
     corners = np.concatenate([paths.ends, *(plane.corners for plane in planes)])
     sheets, gain = fit_sheets(placement, mirrored.traced, corners.min(0), corners.max(0))
     if suffix == ".obj":

@@ -180,7 +180,7 @@ class Contents:
             paths = self.model.learnt_paths(query)
         answer["paths"] = [
             {"points": plain(path.points), "power": plain(path.power_db)} for path in paths
-        ]
+        ]  # power [dB] relative to the strongest path
         return answer | {"place": plain(place)}
 
     def moved(self, receiver: int, position: list[float]) -> "Contents":
