@@ -11,13 +11,18 @@ import sys
 import sysconfig
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TypeVar
 
 from filelock import FileLock, Timeout
 from omegaconf.errors import OmegaConfBaseException
 
 from gaigs.io.files import LOCK, file_message
+
+Part = TypeVar("Part")
+Result = TypeVar("Result")
 
 STOPPING = [signal.SIGINT, signal.SIGTERM]
 """Signals at which a run saves and stops: Ctrl-C, a scheduler's, and a closed terminal's."""
@@ -98,6 +103,31 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
             os.environ.pop(name)
             if value is not None:
                 os.environ[name] = value
+
+
+def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:
+    """Results of a function of each part, in order, computed in as many threads as torch has.
+
+    torch factors many small matrices one after the other, so its own threads do not help there.
+    """
+    import torch  # slow to import
+
+    before = torch.get_num_threads()
+    count = min(before, len(parts))
+    if count < 2:
+        return [function(part) for part in parts]
+    # These settings of torch belong to a thread.
+    has_gradient, is_inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def call(part: Part) -> Result:
+        with torch.inference_mode(is_inference), torch.set_grad_enabled(has_gradient):
+            return function(part)
+
+    try:
+        with ThreadPoolExecutor(count, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(call, parts))
+    finally:
+        torch.set_num_threads(before)  # a thread's call also sets the number of later threads
 
 
 def lacks_memory(error: BaseException | None) -> bool:

@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 50_702,
+    "lines of gaigs/": 50_750,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,

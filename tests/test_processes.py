@@ -260,6 +260,25 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
             pass
 
 
+def test_parts_in_threads_give_what_they_give_one_after_the_other():
+    leaf = torch.ones(5, requires_grad=True)
+
+    def squares(row: int) -> torch.Tensor:
+        if row > 4:
+            raise ValueError("no such row")
+        return leaf[row] ** 2
+
+    for count in (1, 3):
+        with processes.limited_threads(count):
+            results = processes.in_threads(squares, range(5))
+            assert results[4].requires_grad
+            with torch.no_grad():
+                assert not processes.in_threads(squares, range(5))[4].requires_grad
+            with pytest.raises(ValueError, match="no such row"):
+                processes.in_threads(squares, range(6))
+            assert torch.get_num_threads() == count
+
+
 def test_a_fault_of_a_plug_in_has_its_file_and_line(tmp_path):
     file = tmp_path / "plug_in.py"
     file.write_text(

@@ -12,6 +12,7 @@ from gaigs.kriging.kernel import matern
 from gaigs.kriging.likelihood import Choice
 from gaigs.kriging.links import distances, scaled
 from gaigs.kriging.neighbours import Nearest, Readings
+from gaigs.processes import in_threads
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,12 @@ class LocalMixtures(NamedTuple):
         readings = self.readings._replace(count=self.options.neighbours)
         nearest, sets = self._in_order(readings.nearest(places, receivers, own, folds))
         order = sets.argsort()
-        parts = []
-        for part in order.split(self.options.size):
+
+        def mixture(part: Int[Tensor, " n"]) -> LocalMixture:
             near = Nearest(nearest.rows[part], nearest.exists[part])
-            parts.append(self._mixture(places[part], receivers[part], near, sets[part]))
+            return self._mixture(places[part], receivers[part], near, sets[part])
+
+        parts = in_threads(mixture, order.split(self.options.size))
         back = order.argsort()
         return LocalMixture(*(torch.cat(field)[back] for field in zip(*parts, strict=True)))
 

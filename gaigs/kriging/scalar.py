@@ -24,6 +24,7 @@ from gaigs.kriging.local_mixture import LocalMixtures
 from gaigs.kriging.neighbours import HeldOutReadings, Nearest, Readings
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarFit, ScalarOptions, maximise
 from gaigs.kriging.tiles import Merged, Tiles, merged
+from gaigs.processes import in_threads
 
 
 class ScalarProcess(nn.Module):
@@ -95,11 +96,12 @@ class ScalarProcess(nn.Module):
             return self._moments(places, receivers, is_asked=True)[0]
         if not self.is_solved:
             if len(places) * self.options.few < len(self.places):
-                means = torch.empty_like(places[:, 0])
-                for part in torch.arange(len(places)).split(self.options.size // 4):
-                    near = self._near(places[part], receivers[part], self.options.local)
-                    means[part] = near.means
-                return means
+
+                def near_means(part: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
+                    return self._near(places[part], receivers[part], self.options.local).means
+
+                parts = torch.arange(len(places)).split(self.options.size // 4)
+                return torch.cat(in_threads(near_means, parts))
             self._solve()
         means = places.new_zeros(len(places))
         scale = self._choice.scale
@@ -172,9 +174,14 @@ class ScalarProcess(nn.Module):
                 signal = (2 * self.logarithms[receiver, 1]).exp()
                 variances[part] += (signal - whitened.square().sum(0)).clamp_min(0)
         # All receivers together: readings at the same places share a search for neighbours.
-        for part in is_many[receivers].nonzero()[:, 0].split(4 * self.options.size):
+        near_many = is_many[receivers].nonzero()[:, 0]
+
+        def near_variances(part: Int[Tensor, " n"]) -> Float[Tensor, " n"]:
             near = self._near(places[part], receivers[part], self.options.around)
-            variances[part] += near.variances.clamp_min(0)
+            return near.variances.clamp_min(0)
+
+        parts = near_many.split(4 * self.options.size)
+        variances[near_many] += torch.cat(in_threads(near_variances, parts))
         return variances.sqrt()
 
     def _near(
@@ -431,26 +438,28 @@ class ScalarProcess(nn.Module):
         rows = torch.arange(len(values), device=values.device)
         every = readings.nearest(self.places, self.receivers)
         every.exists.logical_and_(every.rows != rows[:, None])  # without the reading itself
-        parts = []
-        for part in rows.split(self.options.size):
-            parts.append((part, Nearest(every.rows[part], every.exists[part])))
         noises = (2 * self.logarithms[self.receivers, 2]).exp()
         for _ in range(self.options.rounds):
-            expected = []
-            for part, nearest in parts:
-                around = readings.around(self.places[part], self.receivers[part], nearest)
-                between = covariances(around, self.logarithms.exp(), choice)
-                variances = noises * factors
-                means, of_process, *_ = conditional(
-                    between, values[around.rows], variances[around.rows]
-                )
-                # The reading's deviation from its neighbours is shared between process and noise.
-                noise = variances[part]
-                shares = noise / (of_process + noise)
-                squares = (shares * (values[part] - means)).square() + of_process * shares
-                expected.append(squares / noises[part])
-            factors = (choice.degrees + torch.cat(expected)) / (choice.degrees + 1)
+            squares = partial(self._noise_squares, every, values, noises * factors)
+            parts = in_threads(squares, rows.split(self.options.size))
+            factors = (choice.degrees + torch.cat(parts) / noises) / (choice.degrees + 1)
         return factors
+
+    def _noise_squares(
+        self,
+        nearest: Nearest,
+        values: Float[Tensor, " k"],
+        variances: Float[Tensor, " k"],
+        rows: Int[Tensor, " n"],
+    ) -> Float[Tensor, " n"]:
+        """Expected squares of the noise of n readings, given the ``nearest`` readings of each."""
+        near = Nearest(nearest.rows[rows], nearest.exists[rows])
+        around = self._readings.around(self.places[rows], self.receivers[rows], near)
+        between = covariances(around, self.logarithms.exp(), self._choice)
+        means, of_process, *_ = conditional(between, values[around.rows], variances[around.rows])
+        # The reading's deviation from its neighbours is shared between process and noise.
+        shares = variances[rows] / (of_process + variances[rows])
+        return (shares * (values[rows] - means)).square() + of_process * shares
 
     def _covariances(
         self, a: Float[Tensor, "m d"], b: Float[Tensor, "n d"], receiver: int
