@@ -88,7 +88,7 @@ def _check_command(command: str) -> None:
 
 @usual_modes()
 def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
-    """Executes the command of a configuration after a check of its keys and the command's name."""
+    """Executes the command of a configuration whose keys and command are checked already."""
     command = config["command"]
     if config["folder"] is not None and command in ("train", "describe", "agreement"):
         remedy = "hydra.run.dir=..." if command == "train" else "data=... and split=..."

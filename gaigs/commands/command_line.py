@@ -66,7 +66,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def describe_job(settings: DictConfig, command: str | None) -> Job:
-    """The job that Hydra's settings and the name of the command describe."""
+    """Facts of the running job, from Hydra's settings and the name of the command."""
     is_sweep = settings.mode is RunMode.MULTIRUN
     mode = "sweep" if is_sweep else "run"
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
@@ -113,17 +113,20 @@ def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
 
 
 def note_task(words: list[str], config: dict) -> None:
-    """Logs a warning if the experiment is meant for another task than the labels'."""
-    parts = [config.get(key) for key in ("task", "data")]
-    if not all(isinstance(part, dict) and "name" in part for part in parts):
+    """Logs a warning if ``words`` of the command line choose an experiment of another task.
+
+    The name of an experiment holds the name of its task, such as ``csi`` in ``mirrored_csi``.
+    """
+    components = [config.get(key) for key in ("task", "data")]
+    if not all(isinstance(component, dict) and "name" in component for component in components):
         return  # the check of the configuration says what is wrong
-    task, data = (part["name"] for part in parts)
+    task, data = (component["name"] for component in components)
     message = "+experiment=%s is for task %s; labels of data=%s are of %s"
     for word in words:
         key, _, name = word.partition("=")
-        others = {*name.split("_")} & {*registry("task").names()} - {task}
-        if key == "+experiment" and others:
-            log.warning(message, name, min(others), data, task)
+        other_tasks = {*name.split("_")} & {*registry("task").names()} - {task}
+        if key == "+experiment" and other_tasks:
+            log.warning(message, name, min(other_tasks), data, task)
 
 
 def remove_without_result(folder: Path) -> None:
@@ -131,11 +134,13 @@ def remove_without_result(folder: Path) -> None:
 
     Such a folder holds only files of Hydra and of the start of a run.
     """
-    begun = {".hydra", "gaigs.log", "config.yaml", "software.json", LOCK}
+    files_of_start = {".hydra", "gaigs.log", "config.yaml", "software.json", LOCK}
+    # The errors: the folder is missing, cannot be read, or another run is using it.
     with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
         names = {path.name for path in folder.iterdir()}
-        is_ours = "config.yaml" not in names or "software.json" in names  # a run writes both
-        if names <= begun and is_ours and not Path.cwd().is_relative_to(folder):
+        # A run writes both: a configuration alone belongs to someone else.
+        is_ours = "config.yaml" not in names or "software.json" in names
+        if names <= files_of_start and is_ours and not Path.cwd().is_relative_to(folder):
             shutil.rmtree(folder)
 
 
@@ -146,13 +151,18 @@ def wrong_flag() -> str | None:
         if word.startswith("-"):
             flag = word.partition("=")[0]
             name = flag.lstrip("-").replace("-", "_")
-            near = configuration.nearest(name, configuration.compose()) or "trainer.max_steps"
-            return f"there is no flag {flag}; options have no dashes, such as {near}=..."
+            similar = configuration.nearest(name, configuration.compose())
+            option = similar or "trainer.max_steps"  # an example
+            return f"there is no flag {flag}; options have no dashes, such as {option}=..."
     return None
 
 
 def compose_and_run() -> None:
-    """Lets Hydra read the command line and run its jobs; exits with 1 after an error's message."""
+    """Lets Hydra read the command line and run its jobs.
+
+    An error ends the process with code 1, after one message if a user can correct it. An unknown
+    flag gives code 2, a closed output 141. ``HYDRA_FULL_ERROR=1`` raises errors instead.
+    """
     if message := wrong_flag():
         print(f"gaigs: {message}", file=sys.stderr)
         raise SystemExit(2)
@@ -164,7 +174,7 @@ def compose_and_run() -> None:
     except Exception as error:
         if full_error == "1":
             raise
-        # Launchers have other pipes.
+        # In a multirun the broken pipe may be a launcher's own.
         if isinstance(error, BrokenPipeError) and not configuration.is_multirun():
             raise SystemExit(141) from None
         message = configuration.explain(error)
@@ -179,7 +189,10 @@ def compose_and_run() -> None:
 
 
 def main() -> None:
-    """The console script ``gaigs``."""
+    """The console script ``gaigs``: jobs, signals, and at the end the tables of a multirun.
+
+    A signal ends the process with code 128 plus its number, as in shells.
+    """
     # Matplotlib reports the making of its font cache.
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
     # On a full disk the log stays silent; the run's own files report it.
@@ -187,7 +200,7 @@ def main() -> None:
     signals = []
 
     def stop(number: int, _) -> None:
-        """Lets jobs in other processes save and end, and waits for them."""
+        """Lets jobs in other processes save and end; outside a multirun also stops this process."""
         signals.append(number)
         processes.hang_up(number)
         processes.forward_to_children(number)
@@ -210,7 +223,7 @@ def main() -> None:
             signal.signal(number, handler)
         try:
             sys.stdout.flush()
-        except BrokenPipeError:  # nobody reads it any more, as behind | head
+        except BrokenPipeError:  # nobody reads the output any more, as behind | head
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             signals.append(13)  # SIGPIPE
         if signals:

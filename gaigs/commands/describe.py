@@ -88,46 +88,48 @@ class Levels:
 
     @classmethod
     def of(cls, links: Links, most: int = 2000) -> "Levels":
-        """Levels of all links; for arrays of up to ``most`` links, evenly spread."""
+        """Levels of all scalar links, or of at most ``most`` evenly spread links with arrays."""
         task = links.task
         index = torch.arange(len(links))
+        title = with_unit(task.quantity, task.unit)
         if task.shape:
             index = evenly(index, most)
-        title = with_unit(f"mean {task.quantity}" if task.shape else task.quantity, task.unit)
+            title = with_unit(f"mean {task.quantity}", task.unit)
         if task.dtype.is_complex:
             title = "mean power [dB]"
-        values = [mean_levels(links, part) for part in index.split(256)]
+        values = [mean_levels(links, block) for block in index.split(256)]
         return cls(index, torch.cat(values), title)
 
 
 def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """The mean over each label of ``index``; for channels the mean power [dB]."""
+    """Mean of each label of the links ``index``, or the mean power [dB] if it is a channel."""
     labels = links.labels[index].reshape(len(index), -1)
     if not labels.is_complex():
         return labels.double().mean(1)
-    power = labels.abs().double().square().mean(1)
-    if links.task.is_channel:  # over the elements and subcarriers that receivers have
+    power = labels.abs().double().square().mean(1)  # (k,)
+    if links.task.is_channel:
+        # Absent elements and subcarriers are 0 in labels. The mean is over the others only.
         task: Any = links.task
         receivers = links.query.receivers[index]
         absent = lacking(links.receivers, receivers, task.elements, task.frequencies)
         power = power / (1 - absent.double().mean((1, 2)))
-    return 10 * power.clamp_min(1e-300).log10()
+    return 10 * power.clamp_min(1e-300).log10()  # no -inf for a channel of zeros
 
 
 def extent_lines(links: Links, levels: Levels) -> list[str]:
-    """Numbers of links and places, ranges of places and levels, parts of the split, repetitions."""
-    sites = links.query.transmitters.unique(dim=0)
-    axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
+    """Lines on links, places, levels, the split and repeated links, for ``Description.read``."""
+    places = links.query.transmitters.unique(dim=0)
+    axes = zip("xyz", places.amin(0).tolist(), places.amax(0).tolist(), strict=True)
     ranges = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in axes)
-    # Quantiles of torch take no more than 2**24 numbers.
+    # By numpy: quantiles of torch take no more than 2**24 numbers.
     low, median, high = np.quantile(levels.values.numpy(), (0.0, 0.5, 1.0)).tolist()
     count = len(links.receivers)
-    receivers = f"{count} receiver{'s' * (count != 1)}"
-    part = f" of {len(levels.index)} links" * (len(levels.index) < len(links))
+    receivers = "1 receiver" if count == 1 else f"{count} receivers"
+    note = f" of {len(levels.index)} links" if len(levels.index) < len(links) else ""
     lines = [
-        f"{links.task.name}: {len(links)} links of {len(sites)} places at {receivers}",
+        f"{links.task.name}: {len(links)} links of {len(places)} places at {receivers}",
         f"places [m]: {ranges}",
-        f"{levels.title}: {low:.3g} to {high:.3g}, median {median:.3g}{part}",
+        f"{levels.title}: {low:.3g} to {high:.3g}, median {median:.3g}{note}",
     ]
     if links.split is not None:
         counts = ", ".join(f"{len(part)} {name}" for name, part in links.split.parts().items())
@@ -188,8 +190,9 @@ def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     everywhere, colours show the level at the first receiver.
     """
     query = links.query
-    pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1).unique(dim=0)
-    places, colours = pairs[:, :3].unique(dim=0, return_counts=True)
+    pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1)
+    distinct_pairs = pairs.unique(dim=0)  # (pairs, 4): place and receiver, without repetitions
+    places, colours = distinct_pairs[:, :3].unique(dim=0, return_counts=True)
     label = "receivers that hear the place"
     if colours.min() == colours.max():
         is_first = query.receivers[levels.index] == 0

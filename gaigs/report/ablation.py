@@ -32,15 +32,19 @@ from gaigs.report.table import (
 
 
 def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
-    """Rows of runs, then of baselines, once for each split; and the settings common to all."""
+    """Rows of the table of runs, and the settings that all runs share.
+
+    Each run has a row. Rows of baselines follow, once for equal scores on a split. A shared setting
+    has no column; it is an override, or one of split, seed and device.
+    """
     overrides = [run.overrides for run in runs]
-    ended = [run.metrics for run in runs if run.metrics is not None]
+    all_metrics = [run.metrics for run in runs if run.metrics is not None]
     names = columns_of(overrides)
-    typed = _common(names, overrides)
+    shared_overrides = _common(names, overrides)
     facts = ("split", "seed", "device")
-    known = _common(facts, ended)
-    varied = [name for name in names if name not in typed]
-    varied_facts = [fact for fact in facts if fact not in known]
+    shared_facts = _common(facts, all_metrics)
+    varied = [name for name in names if name not in shared_overrides]
+    varied_facts = [fact for fact in facts if fact not in shared_facts]
     rows = []
     baselines = {}
     for run in runs:
@@ -48,11 +52,11 @@ def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
         for row in _baselines(run.metrics, "split" in varied_facts):
             # As text: two devices give scores that differ in the last bits.
             baselines[tuple(written(value) for value in row.values())] = row
-    return [*rows, *baselines.values()], typed | known
+    return [*rows, *baselines.values()], shared_overrides | shared_facts
 
 
 def _common(keys: Sequence[str], sources: Sequence[Mapping]) -> dict[str, object]:
-    """The values common to all sources, by key."""
+    """Values that are equal in all sources, by key; a missing key has the value ``""``."""
     common = {}
     for key in keys:
         values = {source.get(key, "") for source in sources}
@@ -81,19 +85,23 @@ def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
 
 def _p_value(metrics: Mapping) -> float | None:
     """p value of the run's main metric against the best baseline; None without a paired test."""
-    name, _ = headline(metrics["task"], metrics["models"])
+    metric_name, _ = headline(metrics["task"], metrics["models"])
+    model = next(iter(metrics["models"]))  # the run's model is first
     test = metrics.get("paired") or {"p": {}}
-    return test["p"].get(next(iter(metrics["models"])), {}).get(name)
+    return test["p"].get(model, {}).get(metric_name)
 
 
 def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
-    """Rows of a run's baselines, without ``<model>_trend``, the model before its kriging."""
+    """Rows of a run's baselines, without ``<model>_trend``, the model before its kriging.
+
+    An unfinished run (None) has no rows. ``has_split`` adds a column with the split.
+    """
     if metrics is None:
         return []
-    first, *names = metrics["models"]
+    model, *baselines = metrics["models"]
     rows = []
-    for name in names:
-        if name != f"{first}_trend":
+    for name in baselines:
+        if name != f"{model}_trend":
             row = {"status": "baseline", "model": name} | metrics["models"][name]
             if has_split:
                 row["split"] = metrics["split"]
@@ -114,8 +122,8 @@ def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
     for group in by_seed(ended):
         metrics = [run.metrics for run in group]
         if len({entry["seed"] for entry in metrics}) < 2:
-            continue
-        scores = [next(iter(entry["models"].values())) for entry in metrics]
+            continue  # the same seed, run twice
+        scores = [next(iter(entry["models"].values())) for entry in metrics]  # of the run's model
         row = {"status": "seeds", "model": next(iter(metrics[0]["models"]))}
         row |= {name: group[0].overrides.get(name, "") for name in varied}
         if "split" not in shared:
@@ -125,9 +133,9 @@ def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
         for name in scores[0]:
             if all(name in score for score in scores):
                 row[name] = Spread.of([score[name] for score in scores])
-        tests = [_p_value(entry) for entry in metrics]
-        if None not in tests:
-            row["p"] = max(filter(None, tests))  # the least certain seed
+        p_values = [_p_value(entry) for entry in metrics]
+        if None not in p_values:
+            row["p"] = max(filter(None, p_values))  # the least certain seed
         rows.append(row)
     return rows
 
@@ -171,7 +179,7 @@ def write_ablation(
     write_csv(folder / "ablation.csv", [*rows, *groups], ("_sd", "_least"))
     rows = [_without_errors(row) for row in rows]
     groups = [_without_errors(row) for row in groups]
-    hidden = set()
+    hidden = set()  # columns that the page or the terminal leaves out
     if not any(row["status"] == "unfinished" for row in rows):
         hidden.add("status")
     varied = [_settings(run, shared) for run in runs]
@@ -188,6 +196,7 @@ def write_ablation(
         text = _latex(groups or rows, rows, metrics, shared)
         write_text(folder / "ablation.tex", text)
 
+    # A terminal has less room.
     hidden |= {name for name, metric in metrics.items() if not metric.is_brief}
     hidden |= {"num_gaussians"} | intervals.keys() - {"coverage_90", "p"}
     caption = "\n".join([*failures, *doubts, f"{settings}; all columns in ablation.csv"])
@@ -199,7 +208,7 @@ def write_ablation(
 
 
 def _settings(run: Run, shared: Mapping) -> str:
-    """The specific overrides of a run, as one text."""
+    """The overrides of a run that not all runs share, as one text."""
     pairs = run.overrides.items()
     return " ".join(f"{key}={value}" for key, value in pairs if key not in shared)
 
@@ -207,12 +216,15 @@ def _settings(run: Run, shared: Mapping) -> str:
 def _speed(
     runs: Sequence[Run], rows: Sequence[dict], shared: Mapping, titles: Mapping[str, str]
 ) -> Figure:
-    """The first metric of each run over its times."""
+    """A figure of the first metric of each finished run over its times of training and inference.
+
+    ``rows`` are those of all runs, then of baselines. The first of the ``titles`` is the metric's.
+    """
     metric = next(iter(titles))
     ended = [run for run in runs if run.metrics is not None]
     done = [row for row in rows if row["status"] == "done"]
     names = [_settings(run, shared) for run in ended]
-    if "" in names or len({*names}) < len(names):
+    if "" in names or len({*names}) < len(names):  # settings do not identify the runs
         names = [run.name for run in ended]
     times = {
         "inference [ms a transmitter]": _numbers(done, "inference_ms"),
@@ -232,14 +244,14 @@ def _numbers(rows: Sequence[Mapping], key: str) -> Float[ndarray, " rows"]:
 
 
 def _text(value: float | int | str | Spread | None, separator: str) -> str:
-    """A cell of a table; the lowest value of several seeds follows after a separator."""
+    """A cell of a table; the lowest value of a ``Spread`` follows after a separator."""
     if isinstance(value, Spread):
         return f"{written(value)}{separator}least {written(value.least)}"
     return written(value)
 
 
 def _without_errors(row: Mapping) -> dict:
-    """A row without columns of standard errors; those of coverages follow their value after ±."""
+    """A row with standard errors only in cells of coverages, such as "0.902 ± 0.013"."""
     shown = {key: value for key, value in row.items() if not key.endswith("_error")}
     for key in row.keys() & {"coverage_50", "coverage_90"}:
         error = row.get(f"{key}_error")
@@ -270,39 +282,41 @@ def _latex(
         rows: All rows, which include the baselines.
         shared: Settings that all runs share, for the caption.
     """
-    shown = [row for row in results if row["status"] in ("done", "seeds")]
-    rule = len(shown) + 1
-    shown += [row for row in rows if row["status"] == "baseline"]
-    known = columns_of(shown)
-    numbers = [name for name in metrics if name in known]
-    first = known.index(numbers[0])
-    texts = [name for name in known[:first] if name not in ("run", "status", "seed", "runs")]
-    if texts == ["model"]:  # a run of a baseline's model is this baseline
-        scored = {row["model"] for row in shown[: rule - 1]}
-        others = [row for row in shown[rule - 1 :] if row["model"] not in scored]
-        shown = shown[: rule - 1] + others
+    run_rows = [row for row in results if row["status"] in ("done", "seeds")]
+    baseline_rows = [row for row in rows if row["status"] == "baseline"]
+    known = columns_of([*run_rows, *baseline_rows])
+    metric_names = [name for name in metrics if name in known]
+    # Columns of settings come before the first metric.
+    settings_end = known.index(metric_names[0])
+    hidden = ("run", "status", "seed", "runs")
+    setting_names = [name for name in known[:settings_end] if name not in hidden]
+    if setting_names == ["model"]:  # a run of a baseline's model is this baseline
+        run_models = {row["model"] for row in run_rows}
+        baseline_rows = [row for row in baseline_rows if row["model"] not in run_models]
+    shown = [*run_rows, *baseline_rows]
     columns = []
-    for name in texts:
+    for name in setting_names:
         cells = [tex(_text(row.get(name), "")) for row in shown]
         columns.append([tex(name), *cells])
-    for name in numbers:
-        values = [None if row.get(name) is None else row[name] for row in shown]
+    for name in metric_names:
+        values = [row.get(name) for row in shown]
         bold = r"\textbf{{{}}}"
         cells = best_in_bold(values, metrics[name].higher_is_better, bold)
-        if name == numbers[0]:
-            for place, row in enumerate(shown):
+        if name == metric_names[0]:
+            for number, row in enumerate(shown):
                 is_known = row.get("p") is not None
-                cells[place] += "$^*$" if is_known and row["p"] < 0.05 else ""
+                cells[number] += "$^*$" if is_known and row["p"] < 0.05 else ""
         columns.append([tex(metrics[name].title), *(cell.replace("±", r"$\pm$") for cell in cells)])
     settings = ", ".join(f"{key}={value}" for key, value in shared.items())
     split = f" on split {tex(shared['split'])}" if "split" in shared else ""
     caption = f"Test scores{split}. Bold: the best, and all that print alike."
     if results[0]["status"] == "seeds":
         caption += r" $\pm$: standard deviation over seeds."
-    if any("$^*$" in cell for cell in columns[len(texts)]):
+    if any("$^*$" in cell for cell in columns[len(setting_names)]):
         caption += " $^*$: differs from the best baseline ($p<0.05$, paired bootstrap over places)."
-    lines = [[*line] for line in zip(*columns, strict=True)]
-    return f"% {settings}\n{latex(lines, len(texts), caption, [rule])}"
+    lines = [[*line] for line in zip(*columns, strict=True)]  # the head is line 0
+    first_baseline = len(run_rows) + 1
+    return f"% {settings}\n{latex(lines, len(setting_names), caption, [first_baseline])}"
 
 
 def _terminal(
@@ -311,11 +325,12 @@ def _terminal(
     """A table for the terminal; columns of costs are dropped until it is at most 80 wide."""
     columns = [column for column in columns_of(rows) if column not in hidden]
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
-    console = Console(width=1000)
+    console = Console(width=1000)  # wide enough to measure any table
     while True:
-        heads = {}
+        heads = {}  # True for a column of numbers
         for column in columns:
-            heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
+            is_number = column in titles
+            heads[titles.get(column, column.replace(".", ".\n"))] = is_number
         lines = []
         for row in rows:
             lines.append([escape(_text(row.get(column), "\n")) for column in columns])

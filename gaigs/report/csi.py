@@ -51,10 +51,10 @@ class CsiFigures(TaskFigures):
     def of_systems(
         self, task: type[Csi], files: Mapping[str, Path], split: str
     ) -> dict[str, Figure]:
-        kind, title = "snr_db", "SNR [dB]"
-        if not own_scores(next(iter(files.values())), kind):  # of unknown phase
-            kind, title = "snr_aligned_db", "SNR, phase removed [dB]"
-        scores = scores_of_systems(files, kind)
+        score, title = "snr_db", "SNR [dB]"
+        if not own_scores(next(iter(files.values())), score):  # channels of unknown phase
+            score, title = "snr_aligned_db", "SNR, phase removed [dB]"
+        scores = scores_of_systems(files, score)
         return {"cdf": cdf(scores, title, "channels", split, (None, None), True)}
 
 
@@ -73,7 +73,10 @@ def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
 
 
 def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude and phase over frequency [Hz] at the strongest element, a row for each link."""
+    """Magnitude and phase of channels over frequency [Hz], a row of panels for each link.
+
+    Each channel is drawn at the label's strongest element.
+    """
     order = np.argsort(frequencies)
     frequencies = frequencies[order]
     unit = "GHz" if frequencies[-1] >= 1e9 else "MHz"
@@ -114,9 +117,11 @@ def front_ends(
     frequencies: Float[ndarray, " s"],
     names: Sequence[str],
 ) -> Figure:
-    """Level and phase of receivers' responses over frequency [Hz], a line for each element.
+    """Level and phase of receivers' front ends over frequency, a line for each element.
 
-    Bands show plus and minus one standard error. Receivers without a response have no row.
+    Bands show plus and minus one standard error. Receivers without a response have no row. The
+    ``responses`` are complex gains; ``errors``, their standard errors, are 0 for elements that an
+    array lacks.
     """
     rows = [number for number, error in enumerate(errors) if error.any()]
     order = np.argsort(frequencies)
@@ -130,6 +135,7 @@ def front_ends(
             ):
                 if not error.any():  # an element that the array lacks
                     continue
+                # To first order a relative error is one of ln |R|, and of the phase [rad].
                 relative = error / np.abs(response)
                 phase = np.unwrap(np.angle(response))
                 curves = (
@@ -150,19 +156,17 @@ def front_ends(
 
 
 def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude over delay, relative to the label's peak, at the label's strongest element.
+    """Magnitude of impulse responses over delay, relative to the label's peak.
 
-    The impulse response is the Fourier sum over the subcarriers, weighted by a Hann window over the
-    band. Its period is one over the median spacing of the subcarriers. One period is drawn. It
-    starts before 0 by the width of the window's main lobe, at most a quarter of the period. A panel
-    ends where the rest is 25 dB below the label's peak.
+    Channels are drawn at the label's strongest element, by ``impulse_response``. A panel ends where
+    all later delays are 25 dB below the label's peak.
 
     Args:
         shown: Channels (k, elements, subcarriers) and their SNR [dB].
         frequencies: At least two subcarriers, in any order and spacing [Hz].
     """
     delays, responses = impulse_response(_pairs(shown), frequencies)
-    levels = decibels(responses)  # (k, 2, delays)
+    levels = decibels(responses)  # (k, 2, delays), prediction and label
     levels -= levels[:, 1:].max(-1, keepdims=True)
     titles = _titles(shown)
     with rc_context(STYLE):
@@ -214,9 +218,13 @@ def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
 
 
 def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
-    """Range of an axis [dB]: all curves, down to 60 dB below a label's peak."""
+    """Range of an axis [dB]: all curves, down to 60 dB below the highest label.
+
+    Args:
+        levels: Curves of predictions and labels, the label last of each pair.
+    """
     highest = levels.max()
-    peak = levels[..., 1, :].max()
+    peak = levels[..., 1, :].max()  # of the labels
     lowest = max(levels[np.isfinite(levels)].min(), peak - 60)
     rim = max(1.0, 0.05 * (highest - lowest))
     return float(lowest - rim), float(highest + rim)
@@ -227,12 +235,16 @@ def impulse_response(
 ) -> tuple[Float[ndarray, " d"], Complex[ndarray, "... d"]]:
     """The impulse response of channels: mean over subcarriers of w(f) h(f) exp(2 pi i f tau).
 
+    The window w is a Hann window over the band. The delays tau span one period, which is one over
+    the median spacing of the subcarriers. They start before 0 by the width of the window's main
+    lobe, at most a quarter of the period.
+
     Args:
         channels: Channels h at the subcarriers.
         frequencies: Subcarriers f, two or more [Hz].
 
     Returns:
-        Delays tau [s], and the response at them. The window w is a Hann window over the band.
+        Delays tau [s], and the response at them.
     """
     start = frequencies.min()
     spacing = np.median(np.diff(np.unique(frequencies)))
@@ -242,22 +254,29 @@ def impulse_response(
     band = highest - lowest
     # Four delays for each that the band resolves, so that no peak falls between two.
     count = int(np.clip(np.ceil(4 * band / spacing), 256, 2**14))
-    delays = np.arange(count) / (count * spacing) - min(2 / band, 0.25 / spacing)
-    windowed = channels * np.sin(np.pi * (frequencies - lowest) / band) ** 2
-    turns = 2j * np.pi * (frequencies - start)
-    # A few delays at a time, as the Fourier matrix takes much memory.
-    parts = []
-    for part in np.array_split(delays, -(-count // 256)):
-        parts.append(windowed @ np.exp(np.outer(turns, part)))
-    return delays, np.concatenate(parts, -1) / len(frequencies)
+    first_delay = -min(2 / band, 0.25 / spacing)
+    delays = np.arange(count) / (count * spacing) + first_delay
+    window = np.sin(np.pi * (frequencies - lowest) / band) ** 2
+    windowed = channels * window
+    turns = 2j * np.pi * (frequencies - start)  # the phase at delay 0 is arbitrary
+    # At most 256 delays at a time, as the Fourier matrix (subcarriers, delays) takes much memory.
+    blocks = []
+    for delay_block in np.array_split(delays, -(-count // 256)):
+        blocks.append(windowed @ np.exp(np.outer(turns, delay_block)))
+    return delays, np.concatenate(blocks, -1) / len(frequencies)
 
 
 def error_against_power(
     powers: Float[ndarray, " k"], errors: Mapping[str, Float[ndarray, " k"]], split: str
 ) -> Figure:
-    """Power of each test link's error against the power of its channel [dB].
+    """Power of each test link's error against the power of its channel.
 
-    It shows the run's model, the first in ``errors``, and the best baseline.
+    The run's model and the baseline with the least power of errors are drawn.
+
+    Args:
+        powers: Power of each channel, linear.
+        errors: Power of each error by model, linear; the run's model first.
+        split: Name of the split.
     """
     model, *others = errors
     baselines = [name for name in others if name != f"{model}_trend"]
@@ -269,8 +288,8 @@ def error_against_power(
         ax = figure.subplots()
         line = {"color": "0.75", "linewidth": 0.8, "zorder": 0, "label": "SNR 0 dB"}
         ax.axline((x.max(), x.max()), slope=1, **line)
-        drawn = zip([model, *baselines[:1]], MARKERS, strict=False)
-        for order, (name, look) in enumerate(drawn):
+        models = zip([model, *baselines[:1]], MARKERS, strict=False)
+        for order, (name, look) in enumerate(models):
             # An SNR of 140 dB is the highest reported.
             error = np.maximum(errors[name], 1e-14 * powers)
             nmse = 10 * np.log10(error.sum() / powers.sum())

@@ -40,7 +40,7 @@ def cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> Figure:
-    """A figure of ``draw_cdf``, with a legend, and the name of the split at the bottom."""
+    """A figure of the cumulative distribution of a score, see ``draw_cdf``, with a legend."""
     with rc_context(STYLE):
         figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
@@ -131,8 +131,8 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
     """
     panels = {}
     for group, title in (("train", "loss and its terms"), ("penalty", "penalties, unweighted")):
-        if names := _of_group(curves, group):
-            panels[title] = names
+        if of_group := _of_group(curves, group):
+            panels[title] = of_group
     # Scores have units of their own.
     for name, curve in _of_group(curves, "validation").items():
         panels[f"validation {_score_title(name)}"] = {name: curve}
@@ -143,10 +143,11 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
         axes = [*figure.subplots(rows, columns, squeeze=False).flat]
         for ax in axes[len(panels) :]:
             ax.remove()
-        for ax, (title, names) in zip(axes, panels.items(), strict=False):
-            sizes = {name: float(abs(values).mean()) for name, (_, values) in names.items()}
-            named = named_ones(sizes, True, next(iter(names)))
-            for name, curve in names.items():
+        for ax, (title, curves_here) in zip(axes, panels.items(), strict=False):
+            # The largest terms have a colour and a name.
+            sizes = {name: float(abs(values).mean()) for name, (_, values) in curves_here.items()}
+            named = named_ones(sizes, True, next(iter(curves_here)))
+            for name, curve in curves_here.items():
                 look = OTHERS
                 if name in named:
                     colour, dash = LINES[named.index(name)]
@@ -154,10 +155,10 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
                 _draw_smoothed(ax, *curve, **look)
             ax.set(xlabel="step", title=title)
             ax.grid()
-            if len(names) > 1:
+            if len(curves_here) > 1:
                 ax.legend()
             is_score = title.startswith("validation")
-            if not is_score and any((values > 0).any() for _, values in names.values()):
+            if not is_score and any((values > 0).any() for _, values in curves_here.values()):
                 ax.set_yscale("log")
                 _round_ticks(ax.yaxis, (1, 2, 5))
         ask(figure, "Has the training settled?")
@@ -171,7 +172,7 @@ def _score_title(name: str) -> str:
 
 
 def _of_group(curves: Mapping[str, Curve], group: str) -> dict[str, Curve]:
-    """Curves of a group by their names without ``<group>/``; the loss comes first."""
+    """Curves whose names start with ``<group>/``, by the rest of the name, the loss first."""
     start = f"{group}/"
     names = [name.removeprefix(start) for name in curves if name.startswith(start)]
     names.sort(key=lambda name: name != "loss")
@@ -198,7 +199,8 @@ def speed_against_error(
             name.
         models: Model of each run, for colours; empty for a single colour.
     """
-    times = {label: values for label, values in times.items() if np.isfinite(values).any()} or times
+    known_times = {kind: values for kind, values in times.items() if np.isfinite(values).any()}
+    times = known_times or times
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
     key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
     key_rows = (len(names) + len(baselines) + 1) // key_columns
@@ -281,4 +283,5 @@ def _draw_smoothed(ax: Axes, steps: ndarray, values: ndarray, **line) -> None:
     if len(values) <= 30:
         line["marker"] = "."
     # The mean over a window is drawn at the window's middle.
-    ax.plot(steps[(window - 1) // 2 :][: len(mean)], mean, **line)
+    middle = (window - 1) // 2
+    ax.plot(steps[middle : middle + len(mean)], mean, **line)

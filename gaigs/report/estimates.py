@@ -1,5 +1,6 @@
 """Pictures of predictions with their intervals."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -44,8 +45,8 @@ def plot_estimate(
     chosen = np.arange(len(names))
     if receiver is not None and request.has_axis:
         chosen = as_receivers(receiver, names.tolist()).reshape(-1).numpy()
-    rank = result.value.ndim - len(request.axes)  # axes of places and receivers
-    count = result.value[(..., *[0] * len(request.axes))].numel() // len(names)
+    rank = result.value.ndim - len(request.axes)  # number of axes of places and receivers
+    count = math.prod(result.value.shape[:rank]) // len(names)  # of places
     if request.axes and not 0 <= place < count:
         raise ValueError(f"place must be from 0 to {count - 1}, got {place}")
     parts = {}
@@ -53,7 +54,8 @@ def plot_estimate(
         part = getattr(result, name)
         if part is not None:
             values = part.detach().cpu().numpy()
-            values = values.reshape(-1, len(names), *values.shape[rank:])[:, chosen]
+            values = values.reshape(-1, len(names), *values.shape[rank:])  # (places, receivers, …)
+            values = values[:, chosen]
             parts[name] = values[place, 0] if request.axes else values
     with rc_context(STYLE):
         if ax is None:
@@ -90,8 +92,8 @@ def _draw_spectrum(
     up = pixel_edges(axes["elevation"].values, -90, 90)
     image = draw_plane(ax, across, up, parts["value"])
     ax.figure.colorbar(image, ax=ax, label=title or "normalised amplitude")
-    spread = np.nanmean(parts["std"])
-    ax.set(xlabel="azimuth [deg]", ylabel="elevation [deg]", title=f"{names[0]} ± {spread:.2g}")
+    deviation = np.nanmean(parts["std"])
+    ax.set(xlabel="azimuth [deg]", ylabel="elevation [deg]", title=f"{names[0]} ± {deviation:.2g}")
 
 
 def _draw_channel(
@@ -107,8 +109,10 @@ def _draw_channel(
     x = axes["subcarrier"].values / 1e6
     order = np.argsort(x)
     look = {"color": BLUE, "alpha": 0.25, "linewidth": 0, "label": "interval"}
-    floor = value.max() / 1e3  # 60 dB below the strongest subcarrier
-    low, high = (decibels(end.clip(floor)) for end in (value - radius, value + radius))
+    # The band ends 60 dB below the strongest subcarrier, as a disc with 0 has no lower end in dB.
+    floor = value.max() / 1e3
+    low = decibels((value - radius).clip(floor))
+    high = decibels((value + radius).clip(floor))
     ax.fill_between(x[order], low[order], high[order], **look)
     ax.plot(x[order], decibels(value)[order], color=BLUE, label="prediction")
     name = " ".join(filter(None, (names[0], f"element {element + 1}")))

@@ -12,7 +12,7 @@ registered: dict[type[Task], type["TaskFigures"]] = {}
 
 
 class TaskFigures:
-    """Base of a task's figures; subclasses override the methods for their figures."""
+    """Base class of a task's figures; a task overrides the methods for its figures."""
 
     def of_run(self, task: Any, folder: Path, links: Links) -> dict[str, Any]:
         """Figures of one run by file name, drawn from the files in its folder."""

@@ -23,25 +23,26 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
     None for a run without intervals.
     """
     file = folder / "predictions.npz"
-    shares = own_scores(file, "shares")
+    coverages = own_scores(file, "shares")  # by model, of intervals with levels between 0 and 1
     with np.load(file) as run:
-        if not shares or "deviation" not in run.files:
+        if not coverages or "deviation" not in run.files:
             return None
         labels = run["labels"]
         predictions = run["prediction"]
         deviations = run["deviation"]
     labels = task.align(torch.from_numpy(labels), torch.from_numpy(predictions)).numpy()
-    exists = ~np.isnan(_magnitudes(deviations))  # elements of the array
-    errors = np.sqrt(np.mean(_magnitudes(predictions - labels) ** 2, 1, where=exists))
+    exists = ~np.isnan(_magnitudes(deviations))  # elements that the array has, (k, numbers)
+    squared_errors = _magnitudes(predictions - labels) ** 2
+    errors = np.sqrt(np.mean(squared_errors, 1, where=exists))  # (k,)
     stated = np.sqrt(np.mean(_magnitudes(deviations) ** 2, 1, where=exists))
     with rc_context(STYLE):
         figure = new_figure(PAGE, 0.52 * PAGE, "compressed")
         left, right = figure.subplots(1, 2)
-        _draw_shares(left, shares)
+        _draw_coverages(left, coverages)
         left.set_title("how often intervals hold")
         left.legend()
-        name = next(iter(shares))
-        (colour, _) = looks(shares)[name]
+        name = next(iter(coverages))
+        (colour, _) = looks(coverages)[name]
         count = _draw_errors(right, stated, errors, colour)
         unit = task.error_unit
         label = f" [{unit}]" if unit else ""
@@ -58,16 +59,16 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
 
 
 def _magnitudes(numbers: Shaped[ndarray, "..."]) -> Float[ndarray, "k numbers"]:
-    """Magnitudes of the numbers of each of k labels."""
+    """Absolute values of k labels of any shape, one row for each label."""
     return np.abs(numbers).astype(float).reshape(len(numbers), -1)
 
 
-def _draw_shares(ax: Axes, shares: Mapping[str, Float[ndarray, " levels"]]) -> None:
+def _draw_coverages(ax: Axes, coverages: Mapping[str, Float[ndarray, " levels"]]) -> None:
     """Draws the coverage of intervals over their level, a line for each model."""
-    count = len(next(iter(shares.values())))
-    levels = np.linspace(0, 1, count + 2)[1:-1]
-    for name, (colour, dash) in looks(shares).items():
-        ax.plot(levels, shares[name], color=colour, linestyle=dash, label=name)
+    count = len(next(iter(coverages.values())))
+    levels = np.linspace(0, 1, count + 2)[1:-1]  # without 0 and 1
+    for name, (colour, dash) in looks(coverages).items():
+        ax.plot(levels, coverages[name], color=colour, linestyle=dash, label=name)
     ax.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
     ax.set(xlabel="level of the interval", ylabel="share of labels inside")
 
@@ -79,18 +80,22 @@ def _draw_errors(
     colour: str,
     groups: int = 12,
 ) -> int:
-    """Draws root mean square errors of groups of links with similar deviations.
+    """Draws root mean square errors of groups of links; returns the number of groups.
 
-    Returns:
-        The number of groups.
+    Links of a group have similar deviations.
+
+    Args:
+        stated: Stated standard deviation of each link.
+        errors: Root mean square error of each link.
+        groups: Largest number of groups.
     """
-    parts = [part for part in np.array_split(np.argsort(stated), groups) if len(part)]
-    across = np.array([np.sqrt((stated[part] ** 2).mean()) for part in parts])
-    up = np.array([np.sqrt((errors[part] ** 2).mean()) for part in parts])
-    ax.plot(across, up, "o", color=colour, markersize=4)
-    furthest = 1.08 * max(across.max(), up.max()) or 1.0
+    rows = [group for group in np.array_split(np.argsort(stated), groups) if len(group)]
+    x = np.array([np.sqrt((stated[group] ** 2).mean()) for group in rows])
+    y = np.array([np.sqrt((errors[group] ** 2).mean()) for group in rows])
+    ax.plot(x, y, "o", color=colour, markersize=4)
+    furthest = 1.08 * max(x.max(), y.max()) or 1.0
     ax.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MaxNLocator(5))
     ax.ticklabel_format(scilimits=(-3, 4))
-    return len(parts)
+    return len(rows)

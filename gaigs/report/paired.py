@@ -13,9 +13,9 @@ from gaigs.report.scores import headline
 
 
 class Paired(NamedTuple):
-    """Models against the best baseline."""
+    """Paired tests of models against the best baseline."""
 
-    baseline: str
+    baseline: str  # name of the best baseline
     places: int  # number of the test links' places that are drawn from
     # Probability of a difference as large by chance, by the names of model and metric.
     p: dict[str, dict[str, float]]
@@ -29,10 +29,11 @@ def paired(
     seed: int = 0,
     most: int = 25_000,
 ) -> Paired | None:
-    """A paired bootstrap over places, for each metric; None without baselines or with one place.
+    """A paired bootstrap test of each model against the best baseline, for each metric.
 
-    Links of one place are dependent, so they are drawn together. Model and baseline are scored on
-    the same drawn places.
+    Places are drawn with replacement, all links of a place together, since they are dependent.
+    Model and baseline are scored on the same drawn places. The result is None without baselines or
+    with a single place.
 
     Args:
         task: Task of the labels.
@@ -46,38 +47,42 @@ def paired(
 
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 16.
     """
-    values = {name: task.summarise(dict(parts)) for name, parts in scores.items()}
-    own, *others = values
-    names = [name for name in others if name != f"{own}_trend"]
-    numbers, groups = torch.unique(places, return_inverse=True)
-    if not names or len(numbers) < 2:
+    values = {name: task.summarise(dict(arrays)) for name, arrays in scores.items()}
+    model, *others = values
+    baselines = [name for name in others if name != f"{model}_trend"]
+    distinct_places, place_of_link = torch.unique(places, return_inverse=True)
+    if not baselines or len(distinct_places) < 2:
         return None
-    metric, title = headline(task.name, values)
-    best = (max if title.higher_is_better else min)(names, key=lambda name: values[name][metric])
-    order = groups.argsort(stable=True)
-    counts = groups.bincount().numpy()  # links of each place
-    firsts = counts.cumsum() - counts  # in the order
-    chosen = drawn(torch.arange(len(counts)), max(2, most * len(counts) // len(groups))).numpy()
+    metric_name, metric = headline(task.name, values)
+    choose = max if metric.higher_is_better else min
+    best = choose(baselines, key=lambda name: values[name][metric_name])
+    by_place = place_of_link.argsort(stable=True)  # links of place 0, then of place 1, ...
+    counts = place_of_link.bincount().numpy()  # links of each place
+    firsts = counts.cumsum() - counts  # position of each place's first link in ``by_place``
+    place_count = max(2, most * len(counts) // len(place_of_link))
+    chosen = drawn(torch.arange(len(counts)), place_count).numpy()
     random = np.random.default_rng(seed)
-    gaps: dict[tuple[str, str], list[float]] = {}
+    differences: dict[tuple[str, str], list[float]] = {}  # model less baseline, by resample
     for _ in range(resamples):
         sample = chosen[random.integers(0, len(chosen), len(chosen))]
         lengths = counts[sample]
-        # All links of the first drawn place, then all of the second, and so on.
+        # Positions in ``by_place`` of all links of the first drawn place, then of the second, ...:
+        # an index that counts all drawn links, shifted to the links of each place.
         shifts = firsts[sample] - (lengths.cumsum() - lengths)
-        rows = order[shifts.repeat(lengths) + np.arange(lengths.sum())]
+        positions = shifts.repeat(lengths) + np.arange(lengths.sum())
+        rows = by_place[positions]
         summaries = {}
-        for name, parts in scores.items():
-            summaries[name] = task.summarise({key: part[rows] for key, part in parts.items()})
-        theirs = summaries.pop(best)
+        for name, arrays in scores.items():
+            summaries[name] = task.summarise({key: array[rows] for key, array in arrays.items()})
+        baseline_summary = summaries.pop(best)
         for name, summary in summaries.items():
             for key, value in summary.items():
-                gaps.setdefault((name, key), []).append(value - theirs[key])
+                differences.setdefault((name, key), []).append(value - baseline_summary[key])
     p: dict[str, dict[str, float]] = {}
-    for (name, key), differences in gaps.items():
-        if np.isnan(differences).any():  # a score is unknown, or both are infinite
+    for (name, key), sampled in differences.items():
+        if np.isnan(sampled).any():  # a score is unknown, or both are infinite
             continue
-        # Two-sided: the smaller tail of the differences, the observed one counted in.
-        tails = np.less_equal(differences, 0).sum(), np.greater_equal(differences, 0).sum()
+        # Two-sided: twice the smaller tail; + 1 counts the observed difference as a resample.
+        tails = np.less_equal(sampled, 0).sum(), np.greater_equal(sampled, 0).sum()
         p.setdefault(name, {})[key] = min(1.0, 2 * (int(min(tails)) + 1) / (resamples + 1))
     return Paired(best, len(chosen), p)

@@ -15,14 +15,14 @@ def as_baseline(name: str) -> str:
 
 
 def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` by model, the run's model first."""
+    """Arrays ``<kind>_<model>`` of a ``predictions.npz`` by model, the run's model first."""
     start = f"{kind}_"
     with np.load(file) as run:
         return {key.removeprefix(start): run[key] for key in run.files if key.startswith(start)}
 
 
 def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` of each system's model, then of the first system's baselines.
+    """Scores ``kind`` of each system's model, then of the first system's baselines, by name.
 
     A baseline is left out if a system of the same name has the same scores.
     """
@@ -42,7 +42,7 @@ def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray
 
 
 class Examples(NamedTuple):
-    """Test samples for a figure."""
+    """Labels, predictions and scores of some test links, for a figure."""
 
     labels: ndarray  # labels (k, *shape)
     predictions: ndarray  # predictions, likewise
@@ -57,9 +57,10 @@ def read_examples(file: Path, kind: str) -> Examples:
     """
     scores = next(iter(own_scores(file, kind).values()))
     order = np.argsort(scores)
-    names = {}
-    for name, rank in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9)):
-        names[int(order[round(rank * (len(order) - 1))])] = name
+    names = {}  # by the number of the sample; of few samples one may have two ranks
+    for name, fraction in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9)):
+        rank = round(fraction * (len(order) - 1))
+        names[int(order[rank])] = name
     shown = [*names]
     with np.load(file) as run:
         labels = run["labels"][shown]

@@ -39,9 +39,14 @@ def map_pages(
     readings: Mapping[str, Float[ndarray, "k 3"]],
     edges: Float[ndarray, "s 2 3"],
 ) -> dict[str, Figure]:
-    """Pages of ``radio_map`` and, if deviations depend on the place, ``deviation_map``, by name."""
+    """Figures of a radio map by file name: maps of values, then of standard deviations.
+
+    Receivers whose deviation is the same everywhere have no map of deviations. Arguments are as for
+    ``radio_maps``.
+    """
     pages = numbered("radio_map", radio_maps(radio_map, gateways, readings, edges))
-    varied = [index for index, deviation in enumerate(_constants(radio_map)) if deviation is None]
+    constants = _constants(radio_map)
+    varied = [receiver for receiver, constant in enumerate(constants) if constant is None]
     if radio_map.deviations is not None and varied:
         deviations = deviation_map(radio_map.only(np.array(varied)))
         pages |= numbered("deviation_map", radio_maps(deviations, gateways, {}, edges))
@@ -49,7 +54,7 @@ def map_pages(
 
 
 def deviation_map(radio_map: RadioMap) -> RadioMap:
-    """The standard deviations as a map."""
+    """A map of the standard deviations of a map's values."""
     if radio_map.deviations is None:
         raise ValueError(
             "the map has no deviations, as the model has no intervals\n"
@@ -66,7 +71,11 @@ def _error_unit(unit: str) -> str:
 
 
 def _constants(radio_map: RadioMap, spread: float = 0.02) -> list[float | None]:
-    """The deviation of each receiver if it is constant, to a fraction ``spread``."""
+    """The standard deviation at each receiver if it is nearly the same at all places; else None.
+
+    Args:
+        spread: Largest range of the middle 98 % of places, as a fraction of the deviation.
+    """
     constants: list[float | None] = [None] * len(radio_map.receivers)
     if radio_map.deviations is not None:
         for index, deviations in enumerate(radio_map.deviations):
@@ -80,9 +89,9 @@ class _Drawing(NamedTuple):
     """Common data of the panels of a radio map."""
 
     radio_map: RadioMap
-    gateways: Mapping[str, Float[ndarray, "3"]]
-    dots: dict[str, Float[ndarray, "k 3"]]  # x, y and label of readings
-    walls: Float[ndarray, "s 2 2"]
+    gateways: Mapping[str, Float[ndarray, "3"]]  # positions of receivers by name [m]
+    dots: dict[str, Float[ndarray, "k 3"]]  # x, y [m] and label of readings, by receiver
+    walls: Float[ndarray, "s 2 2"]  # ends of the edges on the floor [m]
     scale: "_Scale"
 
     @classmethod
@@ -97,9 +106,10 @@ class _Drawing(NamedTuple):
         dots = {}
         for name in radio_map.receivers:
             rows = readings.get(name, np.zeros((0, 3)))
-            dots[name] = rows[:: ceil(len(rows) / 100) or 1]
-        shown = np.concatenate([dot[:, 2] for dot in dots.values()])
-        scale = _scale(radio_map.values, shown, _error_unit(radio_map.unit))
+            stride = ceil(len(rows) / 100) or 1
+            dots[name] = rows[::stride]
+        labels = np.concatenate([rows[:, 2] for rows in dots.values()])
+        scale = _scale(radio_map.values, labels, _error_unit(radio_map.unit))
         # The edges on the floor are the plan of the walls.
         is_low = (edges[..., 2] == edges[..., 2].min(initial=np.inf)).all(1)
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
@@ -217,8 +227,8 @@ def plot_radio_map(
         if not deviation and links.split is not None:
             test = links.split.test
             rows = torch.column_stack((links.query.transmitters[test, :2], links.labels[test]))
-            parts = [rows[links.query.receivers[test] == k].numpy() for k in range(len(gateways))]
-            readings = dict(zip(gateways, parts, strict=True))
+            receivers = links.query.receivers[test]
+            readings = {name: rows[receivers == k].numpy() for k, name in enumerate(gateways)}
     if ax is None:
         figures = radio_maps(floor, gateways, readings, edges)
         axes = itertools.chain.from_iterable(figure.axes for figure in figures)
@@ -253,11 +263,12 @@ class _Extent(NamedTuple):
 
 def _extent(radio_map: RadioMap, walls: Float[ndarray, "s 2 2"]) -> _Extent:
     """The extent of a map, and of a panel with margins that includes the walls."""
-    lowest = np.array((radio_map.x[0], radio_map.y[0]))
-    highest = np.array((radio_map.x[-1], radio_map.y[-1]))
+    first_pixel = np.array((radio_map.x[0], radio_map.y[0]))  # centre of the pixel
+    last_pixel = np.array((radio_map.x[-1], radio_map.y[-1]))
     rows, columns = radio_map.values.shape[1:]
-    half = (highest - lowest) / (np.array((columns, rows)) - 1) / 2  # of a pixel
-    (left, bottom), (right, top) = lowest - half, highest + half
+    half_pixel = (last_pixel - first_pixel) / (np.array((columns, rows)) - 1) / 2
+    left, bottom = first_pixel - half_pixel
+    right, top = last_pixel + half_pixel
     corners = np.concatenate((((left, bottom), (right, top)), walls.reshape(-1, 2)))
     lower = corners.min(0)
     upper = corners.max(0)
@@ -276,22 +287,25 @@ class _Scale(NamedTuple):
 def _scale(
     values: Float[ndarray, "..."], readings: Float[ndarray, " k"], error_unit: str
 ) -> _Scale:
-    """A scale for the middle 98 % of map and readings, with round ends."""
-    parts = [np.quantile(part, (0.01, 0.99)) for part in (values, readings) if part.size]
-    quantiles = np.concatenate(parts)
-    low = quantiles.min()
-    high = quantiles.max()
-    # A flat map has no range: the scale's width then suits its size, or is 1.
+    """A scale for the middle 98 % of map and readings, with round ends.
+
+    Levels [dB] over more than 10 dB have ends at multiples of 5 dB, and a contour every 10 dB.
+    """
+    quantiles = [np.quantile(data, (0.01, 0.99)) for data in (values, readings) if data.size]
+    low = np.concatenate(quantiles).min()
+    high = np.concatenate(quantiles).max()
+    # A flat map has no range: the scale's width then suits its values, or is 1.
     span = float(high - low) or float(abs(high)) or 1.0
     is_wide = error_unit == "dB" and span > 10
-    rounded = 5 if is_wide else round_step(span, 20)
-    step = 10 if is_wide else round_step(span, 8)
-    lower = rounded * np.floor(low / rounded)
-    return _Scale(lower, rounded * (np.floor(high / rounded) + 1), step)
+    multiple = 5 if is_wide else round_step(span, 20)
+    contour_step = 10 if is_wide else round_step(span, 8)
+    lower = multiple * np.floor(low / multiple)
+    upper = multiple * (np.floor(high / multiple) + 1)  # above ``high`` also if that is a multiple
+    return _Scale(lower, upper, contour_step)
 
 
 def _levels(values: Float[ndarray, "rows columns"], scale: _Scale) -> Float[ndarray, " k"]:
-    """Levels of contours within a map's range, at most 20 beyond each end of the scale."""
+    """Values of a map's contour lines: in its range, at most 20 beyond each end of the scale."""
     lowest = max(values.min(), scale.low - 20 * scale.step)
     highest = min(values.max(), scale.high + 20 * scale.step)
     first = np.floor(lowest / scale.step)

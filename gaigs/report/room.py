@@ -258,7 +258,7 @@ def _draw_links(view: _View, links: Links, arrow: float) -> None:
 
 
 def _rims(corners: Float[ndarray, "k 3"]) -> tuple[Float[ndarray, "2 3"], float]:
-    """A box around points with margins, and the length of arrows in it [m]."""
+    """A box around points with margins [m], and the length of arrows in a drawing of it [m]."""
     ends = np.stack((corners.min(0), corners.max(0)))
     arrow = 0.1 * float(np.ptp(ends, 0).max())
     return ends + 1.2 * arrow * np.array([[-1], [1]]), arrow
@@ -294,13 +294,14 @@ def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
     """Draws Gaussians as ellipses of one standard deviation, coloured by strength."""
     flat = [0, view.up]
     covariances = cloud.covariances[:, flat][:, :, flat]  # (k, 2, 2)
-    variances, axes = np.linalg.eigh(covariances)  # ascending
+    variances, axes = np.linalg.eigh(covariances)  # ascending, axes in columns
     # Rounding can leave a flat ellipse a variance below zero.
-    minor, major = 2 * np.sqrt(variances.clip(0)).T
+    minor, major = 2 * np.sqrt(variances.clip(0)).T  # full lengths [m]
+    angles = np.arctan2(axes[:, 1, 1], axes[:, 0, 1])  # of the major axes
     ellipses = EllipseCollection(
         major,
         minor,
-        np.rad2deg(np.arctan2(axes[:, 1, 1], axes[:, 0, 1])),
+        np.rad2deg(angles),
         units="xy",
         offsets=view.project(cloud.means),
         offset_transform=view.ax.transData,
@@ -335,7 +336,7 @@ def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
         outward = normal / np.linalg.norm(normal)
         place = _free_place(view, plane, outward, taken)
         taken.append(place)
-        # Texts are outside the room: their anchors follow from the direction.
+        # Texts are outside the room: -1, 0 or 1 of the direction, plus 1, choose their anchors.
         across, upwards = np.round(outward).astype(int) + 1
         view.ax.annotate(
             f"{plane.number}: {100 * plane.share:.2g} %",
@@ -353,20 +354,21 @@ def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
 def _free_place(
     view: _View, plane: LearntPlane, outward: Float[ndarray, "2"], taken: Sequence[ndarray]
 ) -> Float[ndarray, "2"]:
-    """A place at the outer edge of a plane for its label, away from labels at ``taken`` places.
+    """A place for the label of a plane at its outer edge, or the edge's middle if none is free.
 
-    If no place is free, it is the middle of the edge. ``outward`` is the plane's normal in the
-    panel.
+    Args:
+        outward: Unit normal of the plane in the panel, which points out of the room.
+        taken: Places of other labels.
     """
     width = np.ptp(view.ax.get_xlim())
     height = np.ptp(view.ax.get_ylim())
     needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
     corners = view.project(plane.corners)
     middle = corners.mean(0)
-    flat = corners - middle
-    edge = middle + (flat @ outward).max() * outward
-    along = (-outward[1], outward[0])
-    sideways = np.array(along) * np.ptp(flat @ along)
+    offsets = corners - middle
+    edge = middle + (offsets @ outward).max() * outward  # middle of the outer edge
+    along = (-outward[1], outward[0])  # unit vector along the edge
+    sideways = np.array(along) * np.ptp(offsets @ along)
     for share in (0, 0.2, -0.2, 0.4, -0.4):
         place = edge + share * sideways
         if all((np.abs(place - other) > needed).any() for other in taken):
@@ -381,12 +383,13 @@ def _draw_matter(view: _View, matter: Matter) -> AxesImage:
     pixel = max(right - left, top - bottom) / 300
     x = np.arange(left + pixel / 2, right, pixel)
     y = np.arange(bottom + pixel / 2, top, pixel)
-    # The integral of a Gaussian density over the line of sight.
-    columns = matter.densities * np.sqrt(2 * np.pi) * matter.widths[:, view.along]
-    across = _bells(x, matter, 0)
-    upwards = _bells(y, matter, view.up)
+    # A Gaussian density [dB/m] is a product of three factors. Along the line of sight its integral
+    # is the density at the centre times sqrt(2 pi) width.
+    central_losses = matter.densities * np.sqrt(2 * np.pi) * matter.widths[:, view.along]  # [dB]
+    across = _bells(x, matter, 0)  # (x, obstacles)
+    upwards = _bells(y, matter, view.up)  # (y, obstacles)
     extent = (left, left + len(x) * pixel, bottom, bottom + len(y) * pixel)
-    losses = (upwards * columns) @ across.T  # (y, x)
+    losses = (upwards * central_losses) @ across.T  # (y, x)
     pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
     for corners, loss in zip(matter.boxes, matter.losses, strict=True):
         outline = view.project(corners)
@@ -396,7 +399,10 @@ def _draw_matter(view: _View, matter: Matter) -> AxesImage:
 
 
 def _bells(values: Float[ndarray, " n"], matter: Matter, axis: int) -> Float[ndarray, "n k"]:
-    """The Gaussian functions of obstacles along one axis."""
+    """Each obstacle's factor exp(-offset² / 2) along an axis, at coordinates ``values`` [m].
+
+    The offset is the distance from the obstacle's centre over its width.
+    """
     offsets = (values[:, None] - matter.centres[:, axis]) / matter.widths[:, axis]  # (n, k)
     return np.exp(-(offsets**2) / 2)
 

@@ -56,18 +56,18 @@ def read_metrics(file: Path) -> dict:
 
 
 def _check_metrics(metrics: Any) -> None:
-    """Raises an error unless the entries for tables are present."""
+    """Raises an error unless metrics have the entries that tables need, of the right types."""
     task = metrics["task"]
     if not metrics["models"]:
         raise ValueError("no model")
-    first, _ = headline(task, metrics["models"])
+    main_metric, _ = headline(task, metrics["models"])
     for key, kind in (("split", str), ("seed", int), ("device", str)):
         check_type(repr(key), metrics.get(key), kind)
     check_type("'train_seconds'", metrics.get("train_seconds"), float | None)
     receivers = metrics.get("receivers") or {}
     for models in (metrics["models"], metrics.get("validation") or {}, *receivers.values()):
         for scores in models.values():
-            check_type(repr(first), scores[first], float)
+            check_type(repr(main_metric), scores[main_metric], float)
 
 
 def read_runs(folder: Path) -> list[Run]:
@@ -85,9 +85,9 @@ def read_runs(folder: Path) -> list[Run]:
 
 def _by_number(run: Run) -> list[str | int]:
     """A key to sort runs by name; numbers in names count by value."""
-    # Text and numbers alternate, so that equal types are compared.
-    parts = enumerate(re.split(r"([0-9]+)", run.name))
-    return [int(part) if place % 2 else part for place, part in parts]
+    # The split alternates text and digits, beginning with text: equal types are compared.
+    parts = re.split(r"([0-9]+)", run.name)
+    return [int(part) if number % 2 else part for number, part in enumerate(parts)]
 
 
 def _read_run(folder: Path, name: str) -> Run:
@@ -115,7 +115,7 @@ def _read_run(folder: Path, name: str) -> Run:
 
 
 def _read_yaml(file: Path, kind: type) -> Any:
-    """Content of a file that Hydra wrote; a ValueError if it is of another type."""
+    """Content of a file that Hydra wrote; a ``ValueError`` unless its type is ``kind``."""
     try:
         content = OmegaConf.to_container(OmegaConf.load(file), resolve=kind is dict)
         check_type("its content", content, kind)
@@ -205,7 +205,10 @@ def _add_differing_options(runs: list[Run]) -> None:
 
 
 def _compared(config: Mapping) -> dict:
-    """A configuration without a model's copies of other parts, and without an unused tokenizer."""
+    """The configuration as it is compared between runs.
+
+    It lacks a model's copies of other parts, such as of the deformation, and an unused tokenizer.
+    """
     parts = {**config}
     if _has_unread_tokenizer(config):
         parts.pop("tokenizer", None)
@@ -215,7 +218,7 @@ def _compared(config: Mapping) -> dict:
 
 
 def _failure(folder: Path) -> str | None:
-    """The last line of a job's log, if it is the final error of the job."""
+    """The error that ended a job, from the last line of its log; None if it is no error."""
     logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
     last = "".join(log.read_text(errors="replace") for log in logs).rstrip().rpartition("\n")[2]
     return last.removeprefix("gaigs: ") if last.startswith("gaigs: ") else None

@@ -36,9 +36,10 @@ class ScalarFigures(TaskFigures):
             labels = run["labels"]
             predictions = run["prediction"]
         gateways = {antenna.name: antenna.pose.position.numpy() for antenna in links.receivers}
-        # Of many receivers those with the most test readings, in their order.
+        # The receivers with the most test readings, in the order of the data.
         counts = np.bincount(receiver, minlength=len(gateways))
-        shown = np.sort((-counts).argsort(kind="stable")[:max_receivers])
+        most_readings = (-counts).argsort(kind="stable")[:max_receivers]
+        shown = np.sort(most_readings)
         is_shown = np.isin(receiver, shown)
         readings = np.column_stack((transmitters[:, :2], labels))
         measured = {name: readings[receiver == index] for index, name in enumerate(gateways)}
@@ -141,26 +142,26 @@ def _cells(
     receiver: Int[ndarray, " t"],
     error_unit: str,
 ) -> _Cells:
-    """Readings counted in cells of label and prediction; cells have a round width and cover all
-    labels.
+    """Numbers of readings in square cells of label and prediction.
 
-    Predictions more than 20 cells outside the range of the labels are clipped to this limit.
+    Cells have a round width and cover all labels. Predictions more than 20 cells outside the range
+    of the labels are clipped to this limit.
     """
     # Equal labels have no range: the cell's width then suits their size, or is 1.
     span = float(np.ptp(labels)) or float(np.abs(labels).max()) or 1.0
     width = 2 if error_unit == "dB" else round_step(span, 40)
     limits = (labels.min() - 20 * width, labels.max() + 20 * width)
-    # In numbers of cells, so that no rounding of the cells' edges leaves a reading out.
-    across = labels / width
-    up = predictions.clip(*limits) / width
-    lower = np.floor(min(across.min(), up.min()))
-    upper = np.floor(max(across.max(), up.max())) + 1  # past a value on an edge
+    # In units of a cell, so that no rounding of the cells' edges leaves a reading out.
+    x = labels / width
+    y = predictions.clip(*limits) / width
+    lower = np.floor(min(x.min(), y.min()))
+    upper = np.floor(max(x.max(), y.max())) + 1  # past a value on an edge
     edges = np.arange(lower, upper + 1)
     counts = {}
     for index in np.unique(receiver):
         of_receiver = receiver == index
-        count, *_ = np.histogram2d(across[of_receiver], up[of_receiver], (edges, edges))
-        counts[int(index)] = count.T
+        count, _, _ = np.histogram2d(x[of_receiver], y[of_receiver], (edges, edges))
+        counts[int(index)] = count.T  # rows are predictions, as in an image
     return _Cells(width, width * edges, limits, counts)
 
 

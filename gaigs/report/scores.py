@@ -52,23 +52,29 @@ def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
 
 
 def monitor_names(task: str) -> tuple[str, str | None]:
-    """The score that chooses the best checkpoint; and the metric of its mean, None without one."""
+    """The score of a link that chooses the best checkpoint, and the metric that is its mean.
+
+    The metric is None if the task has no such metric.
+    """
     kind = task_class(task)
     known = kind.metrics()
     # For some tasks the monitor is a property of the instance.
     monitor = kind.monitor if isinstance(kind.monitor, str) else next(iter(known))
-    return monitor, next((name for name in (f"{monitor}_mean", monitor) if name in known), None)
+    for metric in (f"{monitor}_mean", monitor):
+        if metric in known:
+            return monitor, metric
+    return monitor, None
 
 
 def metrics_table(metrics: Mapping) -> Group:
-    """Tables of scores, models down and metrics across; then one metric at each receiver.
+    """Tables of a ``metrics.json``: scores of the models, then the main metric at each receiver.
 
     The best value of each metric is bold.
     """
     known = task_class(metrics["task"]).metrics()
     models = metrics["models"]
-    first, metric = headline(metrics["task"], models)
-    # A split's name may end with a seed of its own.
+    main_name, main_metric = headline(metrics["task"], models)
+    # "run with seed", as a split's name may end with a seed of its own.
     run = f"run with seed {metrics['seed']} on" if "seed" in metrics else "evaluated on"
     caption = escape(f"split {metrics['split']}\n{run} {metrics['device']}")
     table = Table(title="Test scores", caption=caption)
@@ -82,14 +88,16 @@ def metrics_table(metrics: Mapping) -> Group:
             columns.append(_texts(models, name, shown))
     if test := metrics.get("paired"):
         table.add_column(stacked(f"p against {test['baseline']}"), justify="right")
-        columns.append({model: f"{p[first]:.2g}" for model, p in test["p"].items() if first in p})
+        p_values = {model: p[main_name] for model, p in test["p"].items() if main_name in p}
+        columns.append({model: f"{p:.2g}" for model, p in p_values.items()})
     if validation := metrics.get("validation"):
-        table.add_column(stacked(f"{metric.title}, validation"), justify="right")
-        columns.append(_texts(validation, first, metric))
+        table.add_column(stacked(f"{main_metric.title}, validation"), justify="right")
+        columns.append(_texts(validation, main_name, main_metric))
     for model in models:
         table.add_row(escape(model), *(texts.get(model, "") for texts in columns))
-    receivers = metrics.get("receivers")
-    return Group(table, *([_receivers_table(receivers, first, metric)] if receivers else []))
+    if receivers := metrics.get("receivers"):
+        return Group(table, _receivers_table(receivers, main_name, main_metric))
+    return Group(table)
 
 
 def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: int = 20) -> Table:
@@ -110,7 +118,7 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: in
 def _texts(
     models: Mapping[str, Mapping], name: str, metric: Metric, bold: str = "[bold]{}[/bold]"
 ) -> dict[str, str]:
-    """One metric as text by model, the best value in the format ``bold``."""
+    """The values of one metric as text, by model; the best has the format ``bold``."""
     values = [scores[name] for scores in models.values()]
     return dict(zip(models, best_in_bold(values, metric.higher_is_better, bold), strict=True))
 
@@ -154,30 +162,32 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence that compares main scores: of the model, the best baseline, and before kriging."""
+    """A sentence: the model's main score, its distance to the best baseline, and before kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")
     digits = 2 if unit else 3
-    unit = unit and f" {unit}"
+    unit = f" {unit}" if unit else ""
     text = f"{model}: {quantity} {scores[name]:.{digits}f}{unit}"
     trend = ""
     values = {}
-    for other, theirs in baselines:
-        if other == f"{model}_trend":  # the model itself without kriging is no baseline
-            trend = f" Before kriging ({other}) it is {theirs[name]:.{digits}f}{unit}."
+    for baseline, baseline_scores in baselines:
+        value = baseline_scores[name]
+        if baseline == f"{model}_trend":  # the model itself without kriging is no baseline
+            trend = f" Before kriging ({baseline}) it is {value:.{digits}f}{unit}."
         else:
-            values[other] = theirs[name]
+            values[baseline] = value
     if values:
         best = (max if metric.higher_is_better else min)(values, key=values.__getitem__)
         gap = scores[name] - values[best]
         # A gap that is printed as 0 is neither better nor worse.
-        size = f"{abs(gap):.{digits}f}"
+        printed_gap = f"{abs(gap):.{digits}f}"
+        is_level = float(printed_gap) == 0
         is_better = (gap > 0) == metric.higher_is_better
-        side = f"{size}{unit} {'better' if is_better else 'worse'} than"
-        text += f", {side if float(size) else 'level with'} {best}, the best baseline"
+        relation = f"{printed_gap}{unit} {'better' if is_better else 'worse'} than"
+        text += f", {'level with' if is_level else relation} {best}, the best baseline"
         test = metrics.get("paired")
         p = None if test is None else test["p"].get(model, {}).get(name)
-        if p is not None and float(size):
+        if p is not None and not is_level:
             text += f" (p = {p:.2g}{'' if p < 0.05 else ', may be chance'})"
     return f"{text}, on split {metrics['split']}.{trend}"

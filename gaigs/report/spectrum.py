@@ -135,7 +135,7 @@ def pixel_edges(
 
 
 def _colours(limit: float | None) -> dict[str, Any]:
-    """Colours for amplitudes; with a limit, for signed errors up to it."""
+    """Colours for amplitudes from 0 to 1, or for signed errors up to the limit if it is given."""
     if limit is None:
         return {"cmap": "viridis", "vmin": 0, "vmax": 1}
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
@@ -148,7 +148,7 @@ def draw_plane(
     values: Float[ndarray, "rows columns"],
     limit: float | None = None,
 ) -> QuadMesh:
-    """Draws a spectrum over the edges of its pixels [deg]; or errors of at most ``limit``."""
+    """Draws a spectrum, or errors of at most ``limit``, between edges of pixels [deg]."""
     image = ax.pcolormesh(azimuths, elevations, values, rasterized=True, **_colours(limit))
     ax.xaxis.set_major_locator(MultipleLocator(90))
     ax.yaxis.set_major_locator(MultipleLocator(30))

@@ -71,7 +71,7 @@ LINES = [_line(number) for number in range(36)]
 
 
 def _marker(number: int) -> dict:
-    """Look of a point; every five points the shape changes."""
+    """Matplotlib's options for a point by its number; every five points the shape changes."""
     colour = (BLUE, ORANGE, GREEN, PURPLE, SKY)[number % 5]
     edge = {"markeredgecolor": "white", "markeredgewidth": 0.5}
     return {"marker": "os^Dv"[number // 5], "color": colour} | edge
@@ -146,7 +146,7 @@ def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
 
 
 def even_pages(items: Sequence, most: int) -> list[Sequence]:
-    """Items of each page, at most ``most``, with nearly equal numbers."""
+    """Items in pages of nearly equal numbers, at most ``most`` a page."""
     pages = math.ceil(len(items) / most) or 1
     size = math.ceil(len(items) / pages) or 1
     return [items[first : first + size] for first in range(0, len(items), size)]
@@ -197,22 +197,22 @@ def named_ones(
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
-    """Colour and dash pattern of systems by name: equal in all figures, distinct for up to 36
-    systems.
+    """Colour and dash pattern of systems by name, equal in all figures.
 
-    A baseline has the look of the system with its name. A model without its kriging has the colour
-    of the model, and a dotted line.
+    Up to 36 systems look different. A baseline has the look of the system with its name. A model
+    without its kriging has the colour of the model, and a dotted line.
     """
     models = _models([*systems])
-    places = {**_places()}
+    places = {**_places()}  # index into ``LINES`` by model
     known = {*places.values()}
     taken = {places[model] for model in models.values() if model in places}
     looks_by_name = {}
     for name, model in models.items():
         if model not in places:
-            # A place that follows from the name; the next one where a known system has it.
-            turn = crc32(model.encode()) % len(LINES)
-            order = [*range(turn, len(LINES)), *range(turn)]
+            # An unknown model's place follows from its name, so that it looks alike in all figures.
+            # A place of another line in the figure, or of a known system, is passed over.
+            start = crc32(model.encode()) % len(LINES)
+            order = [*range(start, len(LINES)), *range(start)]
             places[model] = min(order, key=lambda place: (place in taken, place in known))
             taken.add(places[model])
         colour, dash = LINES[places[model]]
@@ -244,15 +244,18 @@ def _models(systems: Iterable[str]) -> dict[str, str]:
 
     A variant such as "GAI-GS split=a" counts as its model, unless the model is also a system.
     """
-    titles = {title: name for name, title in _titles().items()}
+    registered_names = {title: name for name, title in _titles().items()}
     models = {}
-    for name in systems:
-        base = name.removesuffix(" (baseline)").removesuffix("_trend")
-        models[name] = titles.get(base, base)
-    for name, model in models.items():
-        variants = (known for title, known in titles.items() if model.startswith(f"{title} "))
-        original = next(variants, model)
-        models[name] = model if original in models.values() else original
+    for system in systems:
+        base = system.removesuffix(" (baseline)").removesuffix("_trend")
+        models[system] = registered_names.get(base, base)
+    for system, model in models.items():
+        originals = [
+            name for title, name in registered_names.items() if model.startswith(f"{title} ")
+        ]
+        original = originals[0] if originals else model
+        if original not in models.values():
+            models[system] = original
     return models
 
 

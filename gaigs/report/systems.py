@@ -26,7 +26,7 @@ from gaigs.report.training_log import read_validations
 
 
 class System(NamedTuple):
-    """A row of the table."""
+    """A row of the table of systems: runs that differ only in the seed, or a baseline."""
 
     model: str  # registered name
     name: str  # name in tables and figures
@@ -54,11 +54,11 @@ def find_systems(
     for row in baselines:
         model = row["model"]
         scores = {key: [value] for key, value in row.items() if isinstance(value, float)}
-        known = values.get(model, {})
-        common = known.keys() & scores.keys()
-        # As printed: a baseline that is a system, too, has one row.
-        alike = [written(known[key][0]) == written(scores[key][0]) for key in common]
-        if not (known and all(alike)):
+        system_scores = values.get(model, {})
+        common = system_scores.keys() & scores.keys()
+        # A baseline that is a system, too, has one row if all scores are printed alike.
+        alike = [written(system_scores[key][0]) == written(scores[key][0]) for key in common]
+        if not (system_scores and all(alike)):
             name = as_baseline(model) if model in values else model
             title = " ".join(filter(None, (name, row.get("split"))))
             systems.append(System(model, title, [], scores))
@@ -68,7 +68,8 @@ def find_systems(
 def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
     """The row of runs that differ only in the seed; its name omits ``shared`` settings."""
     overrides = group[0].overrides
-    # Of a seed that was run twice, in two multiruns, the first run counts: it is stored last.
+    # If a seed was run twice, in two multiruns, the first run counts: in the reversed order it
+    # replaces the later one.
     ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
     runs = [ended[seed] for seed in sorted(ended)]
     model = overrides.get("model")
@@ -184,16 +185,16 @@ def write_systems(
     published_costs = published["costs"].get(task, [])
     scores = _cells(systems, published_scores, titles)
     costs = _cells(systems, published_costs, COSTS)
-    rows = [ours | theirs for ours, theirs in zip(scores, costs, strict=True)]
+    rows = [row | row_costs for row, row_costs in zip(scores, costs, strict=True)]
 
     heads = [{"system": system.name, "model": system.model} for system in systems]
     lines = [head | row for head, row in zip(heads, rows, strict=True)]
     write_csv(folder / "systems.csv", lines, (", sd",))
     names = [system.name for system in systems]
     page = ""
-    for part in (scores, costs):
-        cells = _lines(names, part, metrics, bold="**{}**")
-        page += f"{markdown([['system', *part[0]], *cells])}\n"
+    for table in (scores, costs):
+        cells = _lines(names, table, metrics, bold="**{}**")
+        page += f"{markdown([['system', *table[0]], *cells])}\n"
     page += ", ".join(f"{key}={value}" for key, value in shared.items()) + "\n"
     for column in (*published_scores, *published_costs):
         page += f"- published {column['title']}: {column['source']}\n"
@@ -201,14 +202,14 @@ def write_systems(
     write_text(folder / "systems.md", page)
     for name, figure in _figures(done, task, metrics).items():
         save(figure, folder / f"systems_{name}.png")
-    brief = _brief(scores[0], costs[0], metrics)
-    shown = []
+    terminal_titles = _brief(scores[0], costs[0], metrics)  # a terminal has less room
+    terminal_rows = []
     for row in rows:
-        shown.append({title: row[title] for title in brief})
-    cells = _lines([escape(name) for name in names], shown, metrics)
+        terminal_rows.append({title: row[title] for title in terminal_titles})
+    cells = _lines([escape(name) for name in names], terminal_rows, metrics)
     caption = "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md"
     styles = [None if system.runs else "dim" for system in systems]
-    heads = {"system": False} | dict.fromkeys(brief, True)
+    heads = {"system": False} | dict.fromkeys(terminal_titles, True)  # True for numbers
     return terminal("Systems", heads, cells, caption, styles)
 
 
@@ -225,12 +226,12 @@ def _brief(scores: Mapping, costs: Mapping, metrics: Mapping[str, Metric]) -> li
 def _figures(
     systems: Sequence[System], task: str, metrics: Mapping[str, Metric]
 ) -> dict[str, Figure]:
-    """Figures of the first seed that all systems have, if they share the split.
+    """Figures that compare one run of each system, by name; none if the splits differ.
 
-    The task's figures need the same test links. Figures of validation scores over time need a log
-    of time.
+    The task's figures are drawn if all runs have the same test links. Validation scores over time
+    are drawn for runs whose log has times.
     """
-    runs = _first_seeds(systems)
+    runs = _first_seeds(systems)  # one for each system
     splits = {run.metrics["split"] for run in runs.values()}
     if len(splits) > 1:
         return {}
@@ -255,7 +256,7 @@ def _figures(
 
 
 def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
-    """A run of each system by name: with the lowest common seed, or else its first run."""
+    """One run of each system by name: of the lowest seed of all systems, or else the first."""
     counts: Counter[int] = Counter()
     for system in systems:
         counts.update({run.metrics["seed"] for run in system.runs})
@@ -283,7 +284,9 @@ def _have_same_labels(files: Sequence[Path]) -> bool:
 def _baseline_scores(
     runs: Mapping[str, Run], drawn: Sequence[str], metric: str
 ) -> dict[str, float]:
-    """Validation scores of the baselines by name, without models that have a curve.
+    """Validation scores of the baselines by name, from the first run that has any.
+
+    Models that have a curve are left out.
 
     Args:
         drawn: Names of the systems with a curve.

@@ -14,7 +14,7 @@ from gaigs.io import tables
 
 
 class Spread(NamedTuple):
-    """A score of at least two runs."""
+    """Mean, standard deviation and lowest value of a score over at least two runs."""
 
     mean: float
     deviation: float  # standard deviation of the sample
@@ -42,7 +42,7 @@ def best_in_bold(
     higher_is_better: bool,
     bold: str = "[bold]{}[/bold]",
 ) -> list[str]:
-    """A column as text; the best printed value has the format ``bold``, also if repeated."""
+    """A column as text; all cells that print like the best value have the format ``bold``."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     best = (max if higher_is_better else min)(known, default=None)
@@ -64,26 +64,27 @@ def columns_of(rows: Iterable[Mapping]) -> list[str]:
 def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) -> None:
     """Writes rows as a CSV table; the columns are the keys of all rows.
 
+    A column with a ``Spread`` has its mean; further columns have its deviation and lowest value.
+
     Args:
-        endings: Suffixes of the columns for deviation and lowest value of a ``Spread``; they follow
-            its mean. One suffix means the deviation only.
+        endings: Ends of the names of these further columns. One end means the deviation only.
     """
-    spread = set()
+    spread_columns = set()
     for row in rows:
-        spread |= {column for column, value in row.items() if isinstance(value, Spread)}
+        spread_columns |= {column for column, value in row.items() if isinstance(value, Spread)}
     columns = []
     for column in columns_of(rows):
         columns.append(column)
-        if column in spread:
+        if column in spread_columns:
             columns += [f"{column}{ending}" for ending in endings]
     lines = [columns]
     for row in rows:
         cells = dict(row)
-        for column in row.keys() & spread:
+        for column in row.keys() & spread_columns:
             if isinstance(row[column], Spread):
-                mean, *others = row[column]
+                mean, *further = row[column]
                 cells[column] = mean
-                for ending, number in zip(endings, others, strict=False):
+                for ending, number in zip(endings, further, strict=False):
                     cells[f"{column}{ending}"] = number
         lines.append([cells.get(column, "") for column in columns])
     tables.write_table(file, lines)
@@ -127,7 +128,7 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
 
 
 def tex(text: str) -> str:
-    """Plain text in LaTeX."""
+    """Plain text with its special characters in LaTeX."""
     signs = {sign: f"\\{sign}" for sign in "&%$#_{}"}
     signs |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
     signs |= {"±": r"$\pm$", "²": "$^2$", "−": "$-$", "×": r"$\times$"}

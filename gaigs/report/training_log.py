@@ -37,9 +37,11 @@ def read_curves(paths: Sequence[Path]) -> dict[str, Curve]:
             reader = csv.DictReader(line for line in file if line.endswith("\n"))
             names = [name for name in reader.fieldnames or () if name not in ("step", "epoch")]
             rows = list(reader)
+        # A start goes on from a checkpoint, before the last steps of the start before it.
         begin = min((float(row["step"]) for row in rows), default=math.inf)
         for points in curves.values():
-            for step in [step for step in points if step >= begin]:
+            repeated = [step for step in points if step >= begin]
+            for step in repeated:
                 del points[step]
         for row in rows:
             step = float(row["step"])
@@ -62,9 +64,10 @@ def read_validations(folder: Path, score: str) -> list[Validation]:
     curves = read_log(folder)
     if f"validation/{score}" not in curves:
         return []
-    times, clock = curves.get("seconds", ((), ()))
-    seconds = dict(zip(times, clock, strict=True))
+    timed_steps, times = curves.get("seconds", ((), ()))
+    seconds_at = dict(zip(timed_steps, times, strict=True))
     validations = []
     for step, value in zip(*curves[f"validation/{score}"], strict=True):
-        validations.append(Validation(int(step), float(seconds.get(step, math.nan)), float(value)))
+        seconds = float(seconds_at.get(step, math.nan))
+        validations.append(Validation(int(step), seconds, float(value)))
     return validations

@@ -190,7 +190,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     if not fitted.unseen:  # a model without a training is fitted for the validation, too
         look_ups = {name: registry("model").build(config["model"], scene=links.scene)} | baselines
     fits: dict[str, Model] = {}
-    # Shares of the run's limit; maps and figures have the rest.
+    # Fractions of the run's time limit at which parts end; figures have the remaining time.
     with stage(until=0.86), timed("validation"):
         validation = evaluation.validate(fitted.unseen, look_ups, links, fits)
     with stage(until=0.92):
@@ -222,7 +222,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
 
 
 def _draw(folder: Path, links: Links, model: Model) -> None:
-    """Writes the radio map and the figures."""
+    """Writes the radio map of scalar labels, and all figures, into the run folder."""
     if links.task.is_scalar:
         with timed("radio map"):
             radio_map(model).save(folder / "radio_map.npz")

@@ -44,12 +44,13 @@ class Tried(NamedTuple):
     label: str  # its name and options
     config: dict  # configuration of a run with it
     folder: Path  # folder of this run
-    # Mean score of the links at each place or in each fold, higher ones better, by its key.
+    # Mean score of the links of each place or fold, by the number of the place or fold. The sign is
+    # such that higher is better.
     gains: dict[int, float]
     seconds: float  # duration of fits, training and scores
-    asked: Tensor | None = None  # links that it has not learnt from (k,)
-    values: Tensor | None = None  # their predictions (k, *shape)
-    unseen: Model | None = None  # model without validation links, as it scores at these
+    asked: Tensor | None = None  # numbers of links that the candidate has not learnt from (k,)
+    values: Tensor | None = None  # predictions of these links (k, *shape)
+    unseen: Model | None = None  # the model fitted without validation links
     # Result of the training; None for a look-up, which is fitted once it is chosen.
     fitted: Fitted | None = None
     # Members of a blend and their shares; empty for a single model.
@@ -58,11 +59,11 @@ class Tried(NamedTuple):
 
 
 class ChosenModel(NamedTuple):
-    """The chosen candidate, and a sentence with the reason."""
+    """The chosen candidate, and the reason as a sentence."""
 
     chosen: Tried
     reason: str
-    level: Sequence[Tried] = ()  # candidates that no other surely leads
+    level: Sequence[Tried] = ()  # candidates that no other clearly beats
 
 
 def choose(links: Links, config: dict, folder: Path) -> Fitted:
@@ -93,23 +94,25 @@ def choose(links: Links, config: dict, folder: Path) -> Fitted:
     configs, limit = call("model", _options, options, config=config, links=links)
     # A run with a limit of its own needs the rest for scores and figures.
     end = began + min(limit, 0.8 * stages.left())
-    looked = _try_each(look_up, configs, links, folder, end)
-    contenders = []
+    look_ups = _try_each(look_up, configs, links, folder, end)
+    contenders = []  # the best look-up with scores at the validation places
     reasons = []
-    if looked:
-        best = settle(looked, links)
-        reasons = [f"of look-ups {best.reason}"] if len(looked) > 1 else []
+    if look_ups:
+        best = settle(look_ups, links)
+        reasons = [f"of look-ups {best.reason}"] if len(look_ups) > 1 else []
         contenders = [_validated(best.chosen, links)]
     trained = _try_each(train_candidate, configs, links, folder, end)
-    if not looked and not trained:
+    if not look_ups and not trained:
         raise ValueError("model=auto has no candidate left; the lines above say why")
     choice = settle([*contenders, *trained], links)
-    reason = "; ".join([choice.reason, *reasons] if trained else reasons or [choice.reason])
+    if trained:
+        reasons = [choice.reason, *reasons]
+    reason = "; ".join(reasons or [choice.reason])
     log.info("auto: %s", reason)
     # In Python nothing shows the log, unless the caller has set it up.
     if stages.current().shown and not log.isEnabledFor(logging.INFO):
         print(f"auto: {reason}")
-    facts = _facts([*looked, *trained], choice.chosen, reason, links.task)
+    facts = _facts([*look_ups, *trained], choice.chosen, reason, links.task)
     return _finish(choice.chosen, links, folder, time.monotonic() - began)._replace(facts=facts)
 
 
@@ -122,9 +125,13 @@ def _try_each(
 ) -> list[Tried]:
     """Tries either the look-ups or the trained candidates, in their order, until the time is up.
 
-    ``work`` is ``look_up`` for candidates without a training, otherwise ``train_candidate``. No
-    candidate starts after ``end``, a reading of ``time.monotonic`` [s]; the first look-up is always
-    tried.
+    A candidate that fails is left out with a warning.
+
+    Args:
+        work: ``look_up`` for the candidates without a training, or ``train_candidate`` for others.
+        configs: Configuration of each candidate by its label.
+        end: Reading of ``time.monotonic`` [s] after which no candidate starts. The first look-up is
+            always tried.
     """
     tried: list[Tried] = []
     shown = stages.current().shown
@@ -137,16 +144,17 @@ def _try_each(
         if left <= 0 and (tried or is_trained):
             stages.leave_out(f"model=auto has not tried {label}")
             continue
-        # The first are the cheapest, and leave time to the others.
+        # An equal share of the time that is left. The first candidates are the cheapest, and leave
+        # time to the others.
         share = left / (len(configs) - number)
-        place = folder / "candidates" / str(number)
+        candidate_folder = folder / "candidates" / str(number)
         if is_trained:
-            place.mkdir(parents=True, exist_ok=True)
-            claim(place, config)
+            candidate_folder.mkdir(parents=True, exist_ok=True)
+            claim(candidate_folder, config)
         with stages.watched(max(1.0, share), shown), limited_threads(config["threads"]):
             try:
-                tried.append(work(label, config, links, place))
-            # Such as of a training that diverges, or of memory.
+                tried.append(work(label, config, links, candidate_folder))
+            # For example a training that diverges, or a lack of memory.
             except (ValueError, RuntimeError) as error:
                 log.warning("auto: %s is left out: %s", label, error)
     return tried
@@ -165,11 +173,10 @@ def _options(
             raise ValueError(
                 f"model.candidates must be names or configurations of models, got {candidate!r}"
             )
-        others = {key: value for key, value in options.items() if key != "name"}
-        label = ", ".join([options["name"], *(f"{key}={others[key]}" for key in others)])
-        made = composed(
-            preset(options["name"], links.task.name), {"model": others} if others else {}
-        )
+        changed = {key: value for key, value in options.items() if key != "name"}
+        label = ", ".join([options["name"], *(f"{key}={value}" for key, value in changed.items())])
+        words = preset(options["name"], links.task.name)
+        made = composed(words, {"model": changed} if changed else {})
         configs[label] = _with_changes(made, config, changes)
     if not configs:
         raise ValueError("model.candidates must have a model or more, got none")
@@ -180,25 +187,28 @@ def _options(
 
 
 def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dict:
-    """The configuration of a candidate, with the changes of the ``model=auto`` run."""
-    shared = ("loss", "training", "trainer", "ensemble", "seed")  # of all that are trained
-    kept = ("data", "split", "save_every", "tensorboard", "figures")
-    made |= {key: config[key] for key in kept} | {"threads": config["threads"] or made["threads"]}
+    """The preset ``made`` of a candidate with the options that the ``model=auto`` run has changed.
+
+    ``changes`` are the keys in which the run's ``config`` differs from its own preset.
+    """
+    changeable = ("loss", "training", "trainer", "ensemble", "seed")  # all trained models have them
+    copied = ("data", "split", "save_every", "tensorboard", "figures")
+    made |= {key: config[key] for key in copied} | {"threads": config["threads"] or made["threads"]}
     shows = config["trainer"].get("enable_progress_bar", True)
     made["trainer"]["enable_progress_bar"] = shows
-    ours, theirs = OmegaConf.create(made), OmegaConf.create(config)
+    candidate, run = OmegaConf.create(made), OmegaConf.create(config)
     for key in changes:
-        part, _, rest = key.partition(".")
-        if part in shared:
+        part, _, option = key.partition(".")
+        if part in changeable:
             # A changed component replaces the whole part, with all its options.
-            path = part if rest == "name" else key
-            OmegaConf.update(ours, path, OmegaConf.select(theirs, path), force_add=True)
-        elif part not in (*kept, "model", "baselines", "max_time"):
+            path = part if option == "name" else key
+            OmegaConf.update(candidate, path, OmegaConf.select(run, path), force_add=True)
+        elif part not in (*copied, "model", "baselines", "max_time"):
             raise ValueError(
                 f"{key} is an option of some models, and model=auto tries several\n"
                 "choose one, such as model=mirrored, or leave the option out"
             )
-    plain: Any = OmegaConf.to_container(ours)
+    plain: Any = OmegaConf.to_container(candidate)
     return plain
 
 
@@ -212,10 +222,11 @@ def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
     for unseen in model.unseen(links):
         asked.append(unseen.asked)
         values.append(predicted(unseen.model, links, unseen.asked))
+    spent = time.monotonic() - began
     if not asked:
-        raise ValueError(f"its fit took {time.monotonic() - began:.0f} s; raise model.max_time")
-    one = Tried(label, config, folder, {}, time.monotonic() - began)
-    return _scored(one, links, torch.cat(asked), torch.cat(values))
+        raise ValueError(f"its fit took {spent:.0f} s; raise model.max_time")
+    candidate = Tried(label, config, folder, {}, spent)
+    return _scored(candidate, links, torch.cat(asked), torch.cat(values))
 
 
 def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tried:
@@ -226,8 +237,8 @@ def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tri
     asked = links.split.validation
     values = predicted(unseen, links, asked)
     spent = time.monotonic() - began
-    one = Tried(label, config, folder, {}, spent, unseen=unseen, fitted=fitted)
-    return _scored(one, links, asked, values)
+    candidate = Tried(label, config, folder, {}, spent, unseen=unseen, fitted=fitted)
+    return _scored(candidate, links, asked, values)
 
 
 def _validated(look_up: Tried, links: Links) -> Tried:
@@ -235,7 +246,7 @@ def _validated(look_up: Tried, links: Links) -> Tried:
     asked = links.split.validation
     if look_up.members:
         members = tuple(_validated(member, links) for member in look_up.members)
-        values = _mean([one.values for one in members], look_up.weights)
+        values = _mean([member.values for member in members], look_up.weights)
         return _scored(look_up._replace(members=members), links, asked, values)
     model = registry("model").build(look_up.config["model"], scene=links.scene)
     model.fit(replace(links, split=links.split.validating()))
@@ -244,30 +255,31 @@ def _validated(look_up: Tried, links: Links) -> Tried:
 
 
 def _scored(
-    one: Tried,
+    candidate: Tried,
     links: Links,
     asked: Int[Tensor, " k"],
     values: Tensor,
     groups: Int[Tensor, " k"] | None = None,
 ) -> Tried:
-    """A candidate with predictions and its mean score of each group, by default of each place.
+    """A candidate with its predictions and their mean score in each group (``Tried.gains``).
 
-    Errors within a group are correlated.
+    ``values`` are the predictions (k, *shape) of the links ``asked``. Errors within a group, by
+    default a place, are correlated.
     """
     task = links.task
     scores = task.scores(_labels(links, asked), values)[task.monitor].double()
-    named = links.query[asked].place_keys if groups is None else groups
-    keys, which = named.unique(return_inverse=True)
-    sums = scores.new_zeros(len(keys)).index_add(0, which, scores)
-    means = sums / which.bincount()  # (g,)
+    groups = links.query[asked].place_keys if groups is None else groups
+    keys, group_of_link = groups.unique(return_inverse=True)
+    sums = scores.new_zeros(len(keys)).index_add(0, group_of_link, scores)
+    means = sums / group_of_link.bincount()  # (groups,)
     if not task.higher_is_better:
         means = -means
     gains = dict(zip(keys.tolist(), means.tolist(), strict=True))
-    return one._replace(gains=gains, asked=asked, values=values)
+    return candidate._replace(gains=gains, asked=asked, values=values)
 
 
 def _labels(links: Links, index: Int[Tensor, " k"]) -> Tensor:
-    return torch.cat([links.labels[part] for part in index.split(64)])
+    return torch.cat([links.labels[block] for block in index.split(64)])
 
 
 def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
@@ -278,45 +290,50 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
     errors. Complex channels of unknown phase are not blended.
     """
     choice = pick(tried, links.task)
-    level = choice.level
-    if len(level) < 2 or links.task.phase != "known":
+    unbeaten = choice.level
+    if len(unbeaten) < 2 or links.task.phase != "known":
         return choice
-    asked: Any = level[0].asked
-    for one in level:  # the time limit may have left out folds of some
-        asked = asked[torch.isin(asked, one.asked)]
-    values: Any = [one.values[torch.isin(one.asked, asked)] for one in level]  # type: ignore
+    # Links that all candidates have predicted: the time limit may have left out folds of some.
+    asked: Any = unbeaten[0].asked
+    for candidate in unbeaten:
+        asked = asked[torch.isin(asked, candidate.asked)]
+    values: Any = [one.values[torch.isin(one.asked, asked)] for one in unbeaten]  # type: ignore
     places = links.query[asked].place_keys
     folds = folds_of(links, asked)
-    shares, crossed = stack(_labels(links, asked), values, places, folds)
-    if shares.max() > 0.85:  # a second model is worth more than a tenth
+    weights, fold_weights = stack(_labels(links, asked), values, places, folds)
+    if weights.max() > 0.85:  # all others together have a tenth at most
         return choice
-    blend = _blended(level, shares.tolist())
-    # Links of a fold have the same shares and err together: folds are compared, not places.
-    rivals = zip([blend, *level], [_mean(values, crossed), *values], strict=True)
-    scored = [_scored(one, links, asked, some, folds) for one, some in rivals]
-    judged = pick(scored, links.task, "folds")
-    return judged._replace(chosen=blend) if judged.chosen.members else choice
+    blend = _blended(unbeaten, weights.tolist())
+    # Links of a fold have the same weights and err together: folds are compared, not places.
+    rivals = [_scored(blend, links, asked, _mean(values, fold_weights), folds)]
+    for candidate, predictions in zip(unbeaten, values, strict=True):
+        rivals.append(_scored(candidate, links, asked, predictions, folds))
+    comparison = pick(rivals, links.task, "folds")
+    return comparison._replace(chosen=blend) if comparison.chosen.members else choice
 
 
 def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
     """A blend of candidates by weights; a blend among them is replaced by its members."""
     members: dict[str, Tried] = {}
     shares: dict[str, float] = {}
-    for weight, part in zip(weights, tried, strict=True):
-        for share, one in zip(part.weights or (1.0,), part.members or (part,), strict=True):
-            if weight * share > 0:
-                members[one.label] = one
-                shares[one.label] = weight * share
+    for weight, candidate in zip(weights, tried, strict=True):
+        inner_weights = candidate.weights or (1.0,)
+        inner_members = candidate.members or (candidate,)
+        for inner_weight, member in zip(inner_weights, inner_members, strict=True):
+            if weight * inner_weight > 0:
+                members[member.label] = member
+                shares[member.label] = weight * inner_weight
     label = " + ".join(f"{share:.2g} {name}" for name, share in shares.items())
-    blend = tried[0]._replace(label=label, seconds=sum(one.seconds for one in tried))
+    blend = tried[0]._replace(label=label, seconds=sum(candidate.seconds for candidate in tried))
     return blend._replace(members=tuple(members.values()), weights=tuple(shares.values()))
 
 
 def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
-    """Mean of predictions (k, *shape), weighted by (c,) or for each link (c, k)."""
+    """Mean of the predictions (k, *shape) of c models by weights (c,), or by link (c, k)."""
     total: Any = 0.0
-    for one, share in zip(values, torch.as_tensor(shares), strict=True):
-        total = total + share.to(one.real).reshape(-1, *[1] * (one.ndim - 1)) * one
+    for predictions, share in zip(values, torch.as_tensor(shares), strict=True):
+        label_axes = [1] * (predictions.ndim - 1)
+        total = total + share.to(predictions.real).reshape(-1, *label_axes) * predictions
     return total
 
 
@@ -331,25 +348,29 @@ def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenMode
     3.4.3, for the rule of one standard error; Hansen, Lunde and Nason, The model confidence set,
     2011, for the comparison of all pairs.
     """
-    # The time limit may have left out folds of some.
-    shared = set.intersection(*(set(one.gains) for one in tried))
+    # Places that all candidates have scores of: the time limit may have left out folds of some.
+    shared = set.intersection(*(set(candidate.gains) for candidate in tried))
     keys = sorted(shared)
-    rows = [itemgetter(*keys)(one.gains) for one in tried]
-    gains = torch.tensor(rows).reshape(len(tried), len(keys))  # (c, p)
+    rows = [itemgetter(*keys)(candidate.gains) for candidate in tried]
+    gains = torch.tensor(rows).reshape(len(tried), len(keys))  # (candidates, places)
     means = gains.mean(1)
     best = int(means.nan_to_num(-math.inf, -math.inf).argmax())
-    leads = gains[:, None] - gains  # (c, c, p), of the first over the second
-    # One place has no scatter: the best candidate is taken.
-    scatter = leads.std(2) / len(shared) ** 0.5 if len(shared) > 1 else 0 * leads.mean(2)
-    is_beaten = (leads.mean(2) > scatter).any(0) | ~means.isfinite()  # (c,)
-    chosen = int(is_beaten.int().argmin())
-    level = [one for one, beaten in zip(tried, is_beaten.tolist(), strict=True) if not beaten]
+    leads = gains[:, None] - gains  # (c, c, places), of the first candidate over the second
+    standard_errors = 0 * leads.mean(2)  # one place has no scatter: the best candidate is taken
+    if len(shared) > 1:
+        standard_errors = leads.std(2) / len(shared) ** 0.5
+    is_beaten = (leads.mean(2) > standard_errors).any(0) | ~means.isfinite()  # (c,)
+    chosen = int(is_beaten.int().argmin())  # the first that is not beaten
+    level = [tried[number] for number in range(len(tried)) if not is_beaten[number]]
     signed = means if task.higher_is_better else -means
-    texts = [f"{one.label} {mean:.3g}" for one, mean in zip(tried, signed.tolist(), strict=True)]
+    texts = []
+    for candidate, mean in zip(tried, signed.tolist(), strict=True):
+        texts.append(f"{candidate.label} {mean:.3g}")
     scores = f"mean {task.monitor} over {len(shared)} {unit}: {', '.join(texts)}"
     if chosen == best:
         return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}", level)
-    lead = f"{leads[best, chosen].mean():.2g}, standard error {scatter[best, chosen]:.2g}"
+    error = standard_errors[best, chosen]
+    lead = f"{leads[best, chosen].mean():.2g}, standard error {error:.2g}"
     reason = (
         f"{tried[chosen].label} is the first that none surely leads; {tried[best].label} is "
         f"ahead by {lead}, {scores}"
@@ -358,13 +379,16 @@ def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenMode
 
 
 def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> dict:
-    """Entry of ``metrics.json`` on the choice."""
+    """The entry ``auto`` of ``metrics.json``: the chosen model, the reason, and all scores."""
+    sign = 1 if task.higher_is_better else -1  # gains are negative if lower scores are better
     candidates = {}
-    for one in tried:
-        score = statistics.fmean(one.gains.values()) * (1 if task.higher_is_better else -1)
-        facts = {task.monitor: score, "places": len(one.gains), "seconds": one.seconds}
-        candidates[one.label] = facts
-    labels = [one.label for one in chosen.members or (chosen,)]
+    for candidate in tried:
+        candidates[candidate.label] = {
+            task.monitor: statistics.fmean(candidate.gains.values()) * sign,
+            "places": len(candidate.gains),
+            "seconds": candidate.seconds,
+        }
+    labels = [member.label for member in chosen.members or (chosen,)]
     weights = dict(zip(labels, chosen.weights or (1.0,), strict=True))
     about = {"chosen": chosen.label, "weights": weights, "reason": reason}
     return {NAME: about | {"candidates": candidates}}
@@ -383,15 +407,20 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
     """The result of the chosen candidate's run, or the blend of several candidates.
 
-    The folder gets its checkpoint and log. A look-up is fitted to all known links.
+    The run folder gets the checkpoint, and of a single candidate also the log. A look-up is fitted
+    to all known links.
     """
-    parts = chosen.members or (chosen,)
-    results = [one.fitted or _fit(one.config, links, one.folder) for one in parts]
+    candidates = chosen.members or (chosen,)
+    results = []
+    for candidate in candidates:
+        results.append(candidate.fitted or _fit(candidate.config, links, candidate.folder))
     if chosen.members:
-        names = [one.config["model"]["name"] for one in parts]
-        members = [one.models[name] for one, name in zip(results, names, strict=True)]
+        members = []
+        for candidate, result in zip(candidates, results, strict=True):
+            members.append(result.models[candidate.config["model"]["name"]])
         blend = Ensemble(links.scene, members, [*chosen.weights]).eval()
-        unseen: Any = Ensemble(links.scene, [one.unseen for one in parts], blend.weights).eval()
+        unseen_members: Any = [candidate.unseen for candidate in candidates]
+        unseen = Ensemble(links.scene, unseen_members, blend.weights).eval()
         blend.known_places = links.query[links.split.known].place_keys.unique()
         blend.calibration = calibrated(unseen if blend.is_trained else blend, links)
         checkpoint.save(blend, folder / "best.ckpt")
@@ -401,7 +430,7 @@ def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted
     if (chosen.folder / "log").is_dir():
         shutil.copytree(chosen.folder / "log", folder / "log", dirs_exist_ok=True)
     name = chosen.config["model"]["name"]
-    # The trend of a kriged model is named after the row, too.
+    # Names start with ``auto`` in place of the model's; a kriged model has two, see ``Fitted``.
     models = {NAME + key.removeprefix(name): model for key, model in results[0].models.items()}
     assert chosen.unseen is not None
     return results[0]._replace(models=models, unseen={NAME: chosen.unseen}, seconds=seconds)

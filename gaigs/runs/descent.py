@@ -42,9 +42,13 @@ def descend(
     searched: float,
     rival: float | None = None,
 ) -> tuple[Model, float]:
-    """Trains a model by gradient descent, after ``Model.fit``, which took ``searched`` [s].
+    """Trains a model by gradient descent, after its ``Model.fit``.
 
-    The training ends early if an extrapolation of its validation score stays below ``rival``.
+    Args:
+        folder: Folder of checkpoints and log; an interrupted training there is resumed.
+        searched: Duration of ``Model.fit`` [s].
+        rival: A validation score. The training ends early if an extrapolation of its own score
+            stays below.
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation
@@ -61,8 +65,8 @@ def descend(
     # Lightning calls the keepers of checkpoints after all others.
     callbacks = [budget, KeepBest(best, module.patience, rival), keep_last]
     callbacks += _callbacks(module, links, config)
-    context = {"callbacks": callbacks, "logger": _loggers(folder, config["tensorboard"])}
-    trainer = make_trainer(options, default_root_dir=folder, **context)
+    loggers = _loggers(folder, config["tensorboard"])
+    trainer = make_trainer(options, default_root_dir=folder, callbacks=callbacks, logger=loggers)
     _check_processes(trainer, config)
     if trainer.world_size > 1:  # further processes end with this training
         model.second_start = {}
@@ -79,12 +83,13 @@ def descend(
         content = resumable(last, best, module)
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
+        # The time before the interruption counts for the limit of the run.
         stages.current().began -= content["callbacks"][budget.state_key]["seconds"]
     # Lightning converts after it has loaded a checkpoint, which would round the weights.
     module = trainer.precision_plugin.convert_module(module)
     module.train()  # a model that has been trained or loaded is in evaluation mode
     _run(trainer, module, batches, validation, resumed)
-    if keep_last.received is not None:  # after the last step
+    if keep_last.received is not None:  # a signal after the last step
         raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
     _log_speed(trainer, budget, module.batch_size)
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
@@ -106,7 +111,7 @@ def _identity(links: Links, config: dict) -> dict:
 
 
 def _callbacks(module: Any, links: Links, config: dict) -> list[Callback]:
-    """Callbacks between the steps: density control, revisions, progress line; if configured."""
+    """Configured callbacks of a training: density control, revisions and the progress line."""
     callbacks: list[Callback] = []
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
@@ -199,19 +204,20 @@ def _run(
             distributed.destroy_process_group()
 
 
-def _log_speed(trainer: lightning.Trainer, budget: Budget, places: int) -> None:
+def _log_speed(trainer: lightning.Trainer, budget: Budget, batch_places: int) -> None:
     """Logs the rate of steps, and whether the time limit of the run ended the training early."""
     seconds = budget.seconds - budget.searched
     steps = trainer.global_step
     words = "trained %d steps of %d places in %.0f s: %.1f steps/s"
-    log.info(words, steps, places, seconds, steps / seconds)
+    log.info(words, steps, batch_places, seconds, steps / seconds)
     if budget.seconds >= budget.end and steps < trainer.max_steps:
         stages.leave_out(f"the training ended after {steps} of {trainer.max_steps} steps")
 
 
 def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
     """A trainer that stops and resumes at any step; a ``ValueError`` if an option prevents it."""
-    for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
+    # Messages of lower levels list unused devices.
+    for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     with warnings.catch_warnings():
         # Advice against an option that was chosen.
@@ -226,6 +232,7 @@ def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
     }
     for name, value in usual.items():
         given = getattr(trainer, name)
+        # With the type, since 1 == 1.0 in Python.
         if (type(given), given) != (type(value), value):
             raise ValueError(
                 f"trainer.{name} must be left out\nset trainer.max_steps to end a training early, "

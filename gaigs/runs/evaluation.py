@@ -54,7 +54,10 @@ Scores = dict[str, dict[str, Tensor]]
 
 
 def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not yet fitted, without the run's model."""
+    """The baselines of a run by name, not yet fitted, without the run's model.
+
+    Raises a ``ValueError`` for a baseline that has no name, is named twice or has to be trained.
+    """
     models: dict[str, Model | None] = {}
     for config in configurations:
         config = {"name": config} if isinstance(config, str) else config
@@ -65,10 +68,10 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
         name = config["name"]
         if name in models:
             raise ValueError(f"baselines must have different names, got {name!r} twice")
-        built = None if name == model_name else registry("model").build(config, scene=scene)
-        if built is not None and built.is_trained:
+        baseline = None if name == model_name else registry("model").build(config, scene=scene)
+        if baseline is not None and baseline.is_trained:
             raise ValueError(f"baseline {name!r} has to be trained; run it by model={name}")
-        models[name] = built
+        models[name] = baseline
     return {name: model for name, model in models.items() if model is not None}
 
 
@@ -119,7 +122,7 @@ class Evaluation(JupyterMixin):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The entries of a ``metrics.json`` for tables."""
+        """Entries as in a ``metrics.json``, from which tables are made."""
         facts = {"task": self.task.name, "split": self.split, "device": self.device}
         return facts | {"models": self.models, "paired": self.paired and self.paired._asdict()}
 
@@ -195,10 +198,11 @@ def evaluate(
     if not len(links.split.test):
         raise ValueError("links must have some to test on; take another split")
     if model.known_places is not None:
-        known, test = (
-            links.query[part].place_keys for part in (links.split.known, links.split.test)
-        )
-        if seen := int((torch.isin(test, model.known_places) & ~torch.isin(test, known)).sum()):
+        known = links.query[links.split.known].place_keys
+        test = links.query[links.split.test].place_keys
+        # An official split may test at known places; other places the model must not know.
+        is_seen = torch.isin(test, model.known_places) & ~torch.isin(test, known)
+        if seen := int(is_seen.sum()):
             log.warning(
                 "%s has learnt from the places of %d of %d test links\n"
                 "take links of the split and seed of its training",
@@ -208,13 +212,13 @@ def evaluate(
             )
     task = (links.held_out or links).task
     model_name = name_of(model.trend if isinstance(model, Kriging) else model)
-    models = {model_name: model} | (
-        {f"{model_name}_trend": model.trend} if isinstance(model, Kriging) else {}
-    )
+    models = {model_name: model}
+    if isinstance(model, Kriging):
+        models[f"{model_name}_trend"] = model.trend
     if baselines is None:
-        baselines = (
-            composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
-        )
+        baselines = ()
+        if files_of("task", task.name):  # a task without a configuration has no baselines
+            baselines = composed([f"task={task.name}"], {})["baselines"]
     baselines = [baselines] if isinstance(baselines, str) else baselines
     scores = score(models, build_baselines(baselines, model_name, links.scene), links)
     places = links.query[links.split.test].place_keys
@@ -250,12 +254,17 @@ def score(
 ) -> Scores:
     """Scores of every test link, for models and look-ups.
 
-    Predictions of the first model are written to ``folder``.
-
     Models and look-ups with a calibration also have scores of intervals. If subcarriers are held
     out, ``nearest_frequency`` predicts the label at the nearest known subcarrier, as uplink
-    channels are used for the downlink. ``fits`` receives the fitted look-ups, whose hyperparameters
-    a later fit may reuse.
+    channels are used for the downlink. After the time limit of the run baselines are left out.
+
+    Args:
+        models: Fitted models by name.
+        look_ups: Look-ups that are still to be fitted, by name.
+        folder: Folder of ``predictions.npz``, with the first model's predictions; None: no file.
+        has_intervals: True for scores of intervals; False in a validation.
+        fits: Models of an earlier call by name, whose hyperparameters a look-up may reuse. The
+            models of this call replace them.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -266,13 +275,12 @@ def score(
     earlier = {} if fits is None else fits
     for key in [*models, *look_ups]:
         is_baseline = key in look_ups and key != first
-        # A baseline without time has no fit, or one in haste.
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
         with stages.timed(key):
             model = models[key] if key in models else fitted(look_ups[key], links, earlier.get(key))
-        if is_baseline and stages.is_up():
+        if is_baseline and stages.is_up():  # the limit has cut its fit short
             left_out.append(key)
             continue
         earlier[key] = model
@@ -304,7 +312,7 @@ def score(
 
 
 def _lack(calibration: Calibration | None) -> str:
-    """A text that says what a model lacks for intervals of 90 %."""
+    """What a model lacks for intervals of 90 %, for a warning."""
     count = 0 if calibration is None else int(calibration.counts.min())
     if count >= fewest(0.9):
         return "at new receivers three others with links must calibrate them"
@@ -313,8 +321,9 @@ def _lack(calibration: Calibration | None) -> str:
 
 def able_look_ups(look_ups: Mapping[str, Model], links: Links) -> dict[str, Model]:
     """Look-ups that can predict all receivers of the test links, also ones without known links."""
-    new = links.split.by_receivers
-    return {key: model for key, model in look_ups.items() if model.any_receiver or not new}
+    if not links.split.by_receivers:
+        return dict(look_ups)
+    return {key: model for key, model in look_ups.items() if model.any_receiver}
 
 
 class LinkScores:
@@ -330,12 +339,12 @@ class LinkScores:
     """
 
     def __init__(self, links: Links):
-        asked = links.held_out or links
+        labelled = links.held_out or links  # held-out subcarriers have their own task and labels
         self.size = batch_size(links)
         self.index = links.split.test
-        self.task: Any = asked.task
+        self.task: Any = labelled.task
         self.query = links.query[self.index]
-        self.labels = torch.cat([asked.labels[part] for part in self.index.split(self.size)])
+        self.labels = torch.cat([labelled.labels[rows] for rows in self.index.split(self.size)])
         self.scores: Scores = {}
         self.content: dict[str, Any] = {
             "link": self.index.numpy(),
@@ -350,7 +359,7 @@ class LinkScores:
             self.content["azimuths"] = self.task.directions.azimuths.numpy()
 
     def add(self, key: str, values: Tensor) -> None:
-        """Scores predictions of a model."""
+        """Scores predictions of the model ``key``, and stores them if it is the first model."""
         self.scores[key] = self.task.scores(self.labels, values)
         self.content.setdefault("prediction", self.task.packed(values))
         stored = self.task.stored(self.labels, values, self.scores[key])
@@ -364,19 +373,24 @@ class LinkScores:
         deviations: Tensor,
         is_main: bool,
     ) -> None:
-        """Scores the intervals of a model; deviations of the main model are stored."""
+        """Scores the intervals of a model; calibrated deviations of the main model are stored.
+
+        ``deviations`` are standard deviations of the predictions ``values`` before calibration.
+        """
         if is_main:
-            parts = []
+            blocks = []
             for rows in torch.arange(len(self.index)).split(self.size):
+                # An interval brings the deviation, whatever its level.
                 estimate = calibration.estimate(
                     values[rows], deviations[rows], self.query[rows], 0.9
                 )
-                parts.append(self.task.packed(estimate.std))
-            self.content["deviation"] = np.concatenate(parts)
-        few = thinned(self.task, self.labels, values, deviations)
-        scores = scores_of_links(calibration, few, self.query, self.size)
+                blocks.append(self.task.packed(estimate.std))
+            self.content["deviation"] = np.concatenate(blocks)
+        # Some numbers of each label are enough for scores of intervals.
+        sampled = thinned(self.task, self.labels, values, deviations)
+        scores = scores_of_links(calibration, sampled, self.query, self.size)
         self.scores[key] |= {f"{INTERVALS}{name}": score for name, score in scores.items()}
-        self.content[f"shares_{key}"] = shares_within(calibration, few, self.query)
+        self.content[f"shares_{key}"] = shares_within(calibration, sampled, self.query)
 
 
 def validate(
@@ -387,7 +401,8 @@ def validate(
 ) -> Scores:
     """Scores of the validation links, by models and by look-ups fitted without these links.
 
-    The result is empty without validation links.
+    The result is empty without validation links. Of many validation links a random part is scored.
+    ``models`` have not learnt from validation links; other arguments are as for ``score``.
     """
     if not len(links.split.validation):
         return {}
@@ -398,7 +413,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """Metrics of the table for each receiver with test links, by receiver and model."""
+    """Metrics by receiver and model, for receivers with test links."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):

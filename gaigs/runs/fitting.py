@@ -29,24 +29,24 @@ log = logging.getLogger(__name__)
 
 
 class Fitted(NamedTuple):
-    """Result of ``fit``."""
+    """Models of a run after their training, with durations; the result of ``fit``."""
 
     # The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
     models: dict[str, Model]
-    # The same, not fitted to validation links; empty for a model without a training.
+    # The same models, not fitted to validation links; empty for a model without a training.
     unseen: dict[str, Model]
     start: int  # number of Gaussians before the training
-    # Duration of ``Model.fit``, as of a search for planes, and of the training; None without one.
+    # Duration of ``Model.fit`` and of the training [s]; None without a training.
     seconds: float | None = None
     kriging_seconds: float | None = None  # duration of kriging; None without it
     facts: Mapping[str, Any] = {}  # entries of ``metrics.json`` beside the model's own
 
 
 class Start(NamedTuple):
-    """A model trained from the better of its starts."""
+    """The better of a model's trainings from two starts."""
 
     model: Model
-    config: dict  # which builds it
+    config: dict  # configuration of the run with this start
     seconds: float  # duration of the second training
 
 
@@ -57,11 +57,11 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     model = _checked(model, links, config)
     kriged = _untrained_kriging(model, links, config)
     _log_parts(model, config["model"])
-    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
+    # Parts end at fractions of the run's time limit: the search 0.3, the training 0.5, kriging and
     # intervals 0.8.
     searched, places = _prepare(model, links, name, until=0.3 if model.is_trained else 0.8)
     if is_given:
-        model.second_start = {}  # a better second start would be another object
+        model.second_start = {}  # a given model is trained in place, a second start is not
     start = count_gaussians(model)
     best = folder / "best.ckpt"
     if not model.is_trained:
@@ -70,30 +70,32 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         if is_first() and model.state_dict():
             checkpoint.save(model, best)
         return Fitted({name: model}, {}, start)
+    # Kriging falls back on a simple law of levels where the trained model is worse. A training
+    # that surely stays below the law's score, by two standard errors, would be in vain.
     rival = None
-    held = drawn(links.split.validation)
-    if kriged is not None and model.settles and len(held) > 1:
+    validation = drawn(links.split.validation)
+    if kriged is not None and model.settles and len(validation) > 1:
         with stages.timed("kriging"):
             # Cleaned as for kriging, which then needs no other law.
-            scores = kriged.law_scores(kriged.posterior.cleaned(links), held)
+            scores = kriged.law_scores(kriged.posterior.cleaned(links), validation)
         # Two standard errors below its mean: kriging leaves out a room that is surely worse.
-        rival = (scores.mean() - 2 * scores.std() / len(held) ** 0.5).item()
+        rival = (scores.mean() - 2 * scores.std() / len(validation) ** 0.5).item()
     with stages.stage(until=0.5 / config["ensemble"]), stages.timed("training"):
         model, seconds = descend(model, loss, links, config, folder, searched, rival)
     if not is_first():
         return None
-    model, config, more = _try_second_start(model, loss, links, config, folder)
-    seconds += more
+    model, config, second_seconds = _try_second_start(model, loss, links, config, folder)
+    seconds += second_seconds
     if kriged is not None:
         kriged = _untrained_kriging(model, links, config, kriged)
-    trained = None
+    member = None  # submodel whose weights the checkpoint already has; None: the model itself
     if config["ensemble"] > 1:
-        model, more = _add_members(model, loss, links, config, folder)
-        seconds += more
+        model, member_seconds = _add_members(model, loss, links, config, folder)
+        seconds += member_seconds
         model.known_places = places
         kriged = _untrained_kriging(model, links, config, kriged)
-        trained = "members.0"  # where the weights of the checkpoint belong
-        checkpoint.update(best, model, trained)
+        member = "members.0"
+        checkpoint.update(best, model, member)
     model.calibration = calibrated(model, links)
     if kriged is None:
         checkpoint.update(best, model)
@@ -106,14 +108,14 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
             stages.leave_out("the fit of kriging ended early")
         kriged.calibration = calibrated(validation_model, links)
         kriged.known_places = places
-    checkpoint.update(best, kriged, "trend" if trained is None else f"trend.{trained}")
+    checkpoint.update(best, kriged, "trend" if member is None else f"trend.{member}")
     trend = {f"{name}_trend": model}
     models = {name: kriged} | trend
     return Fitted(models, {name: validation_model} | trend, start, seconds, kriging_seconds)
 
 
 def _checked(model: Model | None, links: Links, config: dict) -> Model:
-    """The model, built if there is none; a ``ValueError`` if the configuration cannot train it."""
+    """The model, built if it is None; a ``ValueError`` if it cannot be trained on these links."""
     if config["ensemble"] < 1:
         raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     if model is None:
@@ -181,14 +183,16 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 
 
 def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> Start:
-    """The trained model, or one from its second start if that validates better.
+    """The trained model, or one trained from its second start if that has a better validation.
 
-    With ``trainer.max_time`` there is no second start, since that limit is for a single training.
+    The options ``model.second_start`` configure the second start. The winner's checkpoint becomes
+    ``best.ckpt``. With ``trainer.max_time`` there is no second start, since that limit is for a
+    single training.
     """
-    own = Start(model, config, 0.0)
+    first = Start(model, config, 0.0)
     is_limited = config["trainer"].get("max_time") is not None
     if is_limited or not model.second_start or not len(links.split.validation):
-        return own
+        return first
     second = config | {"model": config["model"] | model.second_start}
     place = folder / "second_start"
     place.mkdir(exist_ok=True)
@@ -196,7 +200,7 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     with stages.stage(until=0.5 / config["ensemble"]), stages.timed("second start"):
         if stages.is_up():
             stages.leave_out("the training from a second start")
-            return own
+            return first
         other = registry("model").build(second["model"], scene=links.scene)
         other.fit(links)
         other, seconds = descend(other, loss, links, second, place, searched=0.0)
@@ -208,18 +212,23 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
         scores.append(trained["callbacks"][KeepBest.__name__]["best"])
     log.info("validation: %.4f from the first start, %.4f from %s", *scores, model.second_start)
     if scores[1] <= scores[0]:
-        return own._replace(seconds=seconds)
+        return first._replace(seconds=seconds)
     checkpoint.write(content, folder / "best.ckpt")
-    # Curves are those of the latest log.
-    for part in (place / "log").iterdir():
-        shutil.copytree(part, folder / "log" / f"second_start_{part.name}", dirs_exist_ok=True)
+    # Figures draw the curves of the latest log.
+    for version in (place / "log").iterdir():
+        target = folder / "log" / f"second_start_{version.name}"
+        shutil.copytree(version, target, dirs_exist_ok=True)
     return Start(other, second, seconds)
 
 
 def _add_members(
     model: Model, loss: Loss, links: Links, config: dict, folder: Path
 ) -> tuple[Ensemble, float]:
-    """An ensemble of a model and others of the next seeds, and the others' training time [s]."""
+    """An ensemble of a trained model and of models that are trained here with the next seeds.
+
+    Returns:
+        The ensemble, and the duration of the trainings here [s].
+    """
     members = [model]
     total = 0.0
     for number in range(1, config["ensemble"]):

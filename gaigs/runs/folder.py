@@ -29,12 +29,12 @@ def claim(folder: Path, config: dict) -> None:
     file = folder / "config.yaml"
     files = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
     names = [*files.split(), "figures", "last.ckpt", "metrics.json"]
-    there = [name for name in names if (folder / name).exists()]
-    if there and not is_configuration(file):
-        raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
-    trainings = (folder, folder / "second_start", *folder.glob("members/*"))
-    for place in (folder / "figures", *trainings):
-        remove_parts(place)  # a killed run leaves temporary files
+    existing = [name for name in names if (folder / name).exists()]
+    if existing and not is_configuration(file):
+        raise ValueError(f"{folder} holds {', '.join(existing)} of something else\n{ANOTHER}")
+    training_folders = (folder, folder / "second_start", *folder.glob("members/*"))
+    for written in (folder / "figures", *training_folders):
+        remove_parts(written)  # a killed run leaves temporary files
     # Without a checkpoint or scores there is nothing to resume: the run starts from scratch.
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
@@ -70,7 +70,7 @@ def software(config: dict) -> dict[str, str]:
 
 
 def stored_software(folder: Path) -> dict[str, str]:
-    """``software`` at the start of a run; empty if unknown."""
+    """Versions and digests stored at the start of a run, as of ``software``; empty if unknown."""
     try:
         return json.loads((folder / "software.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -79,8 +79,8 @@ def stored_software(folder: Path) -> dict[str, str]:
 
 def warn_of_changes(folder: Path, model: dict) -> None:
     """Warns if sources of a model's plug-ins have changed, so that stored numbers are invalid."""
-    there = stored_software(folder)
-    changed = [key for key, digest in digests(model).items() if there.get(key, digest) != digest]
+    stored = stored_software(folder)
+    changed = [key for key, digest in digests(model).items() if stored.get(key, digest) != digest]
     if changed:
         log.warning(
             "the source of %s has changed since %s was trained: predictions differ",
@@ -90,16 +90,20 @@ def warn_of_changes(folder: Path, model: dict) -> None:
 
 
 def check_software(folder: Path, config: dict) -> None:
-    """Checks that a run is resumed by its original software; patch versions may differ."""
-    there = stored_software(folder)
-    here = software(config)
-    began = str(there.get("gaigs", "0.1 or earlier"))
-    if began.split(".")[:2] != here["gaigs"].split(".")[:2]:
+    """Raises a ``ValueError`` unless a run is resumed by its original software.
+
+    Versions of gaigs may differ in the third number. Plug-ins must have the same source.
+    """
+    stored = stored_software(folder)
+    current = software(config)
+    stored_version = str(stored.get("gaigs", "0.1 or earlier"))
+    version = current["gaigs"]
+    if stored_version.split(".")[:2] != version.split(".")[:2]:
         raise ValueError(
-            f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}"
+            f"{folder} was begun by gaigs {stored_version}, and this is {version}\n{ANOTHER}"
         )
-    plugins = (here.keys() | there.keys()) - {"gaigs"}
-    changed = sorted(key for key in plugins if here.get(key) != there.get(key))
+    plugins = (current.keys() | stored.keys()) - {"gaigs"}
+    changed = sorted(key for key in plugins if current.get(key) != stored.get(key))
     if changed:
         raise ValueError(
             f"the source of {', '.join(changed)} has changed since {folder} was begun\n"
@@ -116,12 +120,15 @@ def is_configuration(file: Path) -> bool:
     return isinstance(content, dict) and {"model", "data"} <= content.keys()
 
 
-def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Raises a ``ValueError`` unless a resumed training has its original links and split."""
+def check_same_links(stored: dict, current: dict, path: Path) -> None:
+    """Raises a ``ValueError`` unless a resumed training has its original links and split.
+
+    ``stored`` comes from the checkpoint ``path``, ``current`` from the resumed run.
+    """
     parts = ("train", "validation", "test")
-    has_split = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
-    has_scene = are_alike(there.get("scene"), here.get("scene"))
-    if not (has_split and has_scene and there["links"] == here["links"]):
+    has_split = all(torch.equal(stored["split"][part], current["split"][part]) for part in parts)
+    has_scene = are_alike(stored.get("scene"), current.get("scene"))
+    if not (has_split and has_scene and stored["links"] == current["links"]):
         raise ValueError(
             f"the data have changed since {path} was written: another split, or other "
             f"transmitters, receivers, frequencies or labels\n{ANOTHER}"
@@ -129,15 +136,18 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries and receivers, and of labels in memory: files are slow to decode."""
-    parts = [links.query.transmitters, links.query.receivers]
+    """A digest of queries and receivers, and of labels in memory.
+
+    Labels in files are left out, since they are slow to decode.
+    """
+    tensors = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
-        parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]
+        tensors += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]
     if links.query.frequencies is not None:
-        parts.append(links.query.frequencies)
+        tensors.append(links.query.frequencies)
     if isinstance(links.labels, Tensor):
-        parts.append(links.labels)
+        tensors.append(links.labels)
     digest = hashlib.sha256()
-    for part in parts:
-        digest.update(part.contiguous().numpy().tobytes())
+    for tensor in tensors:
+        digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()

@@ -74,6 +74,7 @@ def train(
         options["enable_progress_bar"] = False
     made = _made(model)
     check_fit(links, None if made is None else made.scene)
+    # Options that are components themselves, not their configurations.
     parts = {key: option for key, option in options.items() if hasattr(option, "configuration")}
     config = _configuration(model, made, links, overrides, options)
     with contextlib.ExitStack() as stack:
@@ -96,7 +97,7 @@ def train(
 
 
 def _made(model: str | Model) -> Model | None:
-    """The model for further training; None for a name."""
+    """The model that is trained further; None for the name of a model, which is built later."""
     if isinstance(model, str):
         return None
     made = copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
@@ -111,7 +112,12 @@ def _made(model: str | Model) -> Model | None:
 def _configuration(
     model: str | Model, made: Model | None, links: Links, overrides: Sequence[str], options: dict
 ) -> dict:
-    """The configuration of a training on existing links, of a model that may exist."""
+    """The configuration of a training on existing links.
+
+    Args:
+        model: First argument of ``train``.
+        made: The model that is trained further; None: the training builds it.
+    """
     name = model if made is None else configuration_of(made)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
         raise ValueError(

@@ -43,8 +43,8 @@ def on_split(
             f"{nearest.missing:,} test links have no known link of their receiver and carrier, "
             "and are left out"
         )
-    cells = agreement.cell(nearest.distances, nearest.separations)
-    cells = cells[np.isin(cells, [*agreement.scores])]  # a part of the links may have no such pair
+    cells = agreement.cell(nearest.distances, nearest.separations)  # of each test link
+    cells = cells[np.isin(cells, [*agreement.scores])]  # only cells with compared pairs
     if len(cells):
         low, median, high = np.quantile(nearest.distances, (0.1, 0.5, 0.9))
         remarks.append(
@@ -58,6 +58,7 @@ def on_split(
             "one label as near: random pairs of the cell that a test link and its nearest known "
             "one are in"
         )
+        # With noise of variance s², two labels differ by 2 s² and a label from the mean by s².
         averaged = links.task.averaged(scores)
         if averaged is not None:
             rows["mean of many as near"] = links.task.summarise(averaged)
@@ -77,17 +78,17 @@ class NearestLinks(NamedTuple):
     """The nearest known link of each test link."""
 
     distances: Float[ndarray, " k"]  # to the nearest known link of its receiver and carrier [m]
-    separations: ndarray  # measurements between the two links
+    separations: ndarray  # (k,), number of measurements from one of the two links to the other
     missing: int  # number of test links without a known link of their receiver and carrier
 
 
 def nearest_known(links: Links) -> NearestLinks:
     """For each test link, the nearest known link of its receiver and carrier."""
     places = links.query.transmitters.double().numpy()
-    order = visits(links)
+    order = visits(links)  # number of each link's measurement
     test = links.split.test.numpy()
     known = links.split.known.numpy()
-    distances = [np.zeros(0)]
+    distances = [np.zeros(0)]  # at least one array to concatenate
     separations = [np.zeros(0)]
     for group in groups_of(links):
         tested = np.intersect1d(group, test)
@@ -117,19 +118,20 @@ def drawn_scores(
         score: Name of the score by which pairs were compared.
         random: Draws a cell, then a pair of this cell.
     """
-    numbers, counts = np.unique(random.choice(cells, max(fewest, len(cells))), return_counts=True)
+    drawn_cells = random.choice(cells, max(fewest, len(cells)))
+    numbers, counts = np.unique(drawn_cells, return_counts=True)
     by_cell = []
     for cell, count in zip(numbers, counts, strict=True):
         scores = agreement.scores[int(cell)]
-        which = torch.from_numpy(random.integers(len(scores[score]), size=count))
-        by_cell.append({name: values[which] for name, values in scores.items()})
+        pairs = torch.from_numpy(random.integers(len(scores[score]), size=count))
+        by_cell.append({name: values[pairs] for name, values in scores.items()})
     return joined_scores(by_cell)
 
 
 def baseline_rows(links: Links, baselines: list[Mapping]) -> dict[str, dict[str, float]]:
-    """Metrics of the baselines on the test links."""
+    """Metrics of the baselines on the test links, by the baseline's name in backquotes."""
     test = links.split.test
-    labels = torch.cat([links.labels[part] for part in test.split(evaluation.BATCH)])
+    labels = torch.cat([links.labels[block] for block in test.split(evaluation.BATCH)])
     rows = {}
     for name, look_up in evaluation.build_baselines(baselines, "", links.scene).items():
         values = evaluation.predicted(evaluation.fitted(look_up, links), links, test)

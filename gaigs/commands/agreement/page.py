@@ -51,7 +51,8 @@ def write(
         titles = {name: metric.title for name, metric in task.metrics().items()}
         lines = [["predicted by", *titles.values()]]
         for name, row in rows.items():
-            lines.append([name, *(_number(row[key], title) for key, title in titles.items())])
+            numbers = [_number(row[key], title) for key, title in titles.items()]
+            lines.append([name, *numbers])
         parts.append(f"What that lets expect on split {split}:\n\n{markdown(lines)}")
     compared = [cell.compared for cell in cells if cell.compared < cell.pairs]
     if compared:
@@ -67,10 +68,10 @@ def write(
 def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
     """Rows of a table with its heading: distances of places down, separations across."""
     texts = {(cell.distance, cell.separation): cell.text(score) for cell in cells}
-    columns = sorted({cell.separation for cell in cells})
-    lines = [["distance [m]", *map(_separation, columns)]]
-    for distance in dict.fromkeys(cell.distance for cell in cells):
-        row = [texts.get((distance, column), "") for column in columns]
+    separations = sorted({cell.separation for cell in cells})
+    lines = [["distance [m]", *map(_separation, separations)]]
+    for distance in dict.fromkeys(cell.distance for cell in cells):  # each once, in their order
+        row = [texts.get((distance, separation), "") for separation in separations]
         lines.append([_distance(distance), *row])
     return lines
 
@@ -78,13 +79,13 @@ def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
 def figure(score: str, cells: Sequence[Cell]) -> Figure:
     """Median and 10th to 90th percentile against distance, a line for each range of separations."""
     distances = list(dict.fromkeys(cell.distance for cell in cells))
-    columns = sorted({cell.separation for cell in cells})
+    separations = sorted({cell.separation for cell in cells})
     with rc_context(STYLE):
         figure = new_figure(COLUMN, 3.15)
         ax = figure.subplots()
-        for number, column in enumerate(columns):
-            members = [cell for cell in cells if cell.separation == column]
-            shift = 0.14 * (number - (len(columns) - 1) / 2)  # lines beside each other
+        for number, separation in enumerate(separations):
+            members = [cell for cell in cells if cell.separation == separation]
+            shift = 0.14 * (number - (len(separations) - 1) / 2)  # lines beside each other
             x = [distances.index(cell.distance) + shift for cell in members]
             low, median, high = np.array([cell.quantiles for cell in members]).T
             colour, dash = LINES[number % len(LINES)]
@@ -92,7 +93,7 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
                 x,
                 median,
                 [median - low, high - median],
-                label=_separation(column),
+                label=_separation(separation),
                 color=colour,
                 linestyle=dash,
                 marker="os^Dv"[number % 5],
@@ -114,7 +115,7 @@ def _number(value: float, title: str) -> str:
 
 
 def _distance(bounds: tuple[float, float]) -> str:
-    """The label of a row; bounds in m, 0 and 0 for pairs at one place."""
+    """The label of a row of distances; bounds [m], 0 and 0 for pairs at one place."""
     low, high = bounds
     if not high:
         return "same place"
@@ -122,7 +123,7 @@ def _distance(bounds: tuple[float, float]) -> str:
 
 
 def _separation(bounds: tuple[int, float]) -> str:
-    """The label of a column; bounds in measurements, the upper one infinite in the last column."""
+    """The label of a column; the largest separation is infinite in the last column."""
     low, high = bounds
     if math.isinf(high):
         return f"over {low - 1:,}" if low else "any"

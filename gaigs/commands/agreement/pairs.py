@@ -25,12 +25,13 @@ class Agreement:
     The separation of a pair is the number of measurements from one of its labels to the other.
     """
 
-    # Upper edges of the rows [m]; the first row holds pairs at one place, its edge is next to 0.
+    # Upper edges of the rows [m]. The first row holds pairs at one place: its edge is the smallest
+    # number above 0.
     distances: ndarray
     # Largest separation in each column but the last, ascending [measurements].
     separations: ndarray
     pairs: Int[ndarray, "rows columns"]  # number of pairs in each cell
-    share: float  # share of the pairs that were counted
+    share: float  # fraction of the links whose pairs with all links were counted
     # Scores of the compared pairs by cell (row times columns plus column) and by the score's name.
     scores: dict[int, dict[str, Tensor]]
     step: float  # median distance from a measurement to the next [m]
@@ -48,20 +49,25 @@ class Agreement:
         return row * (len(self.separations) + 1) + column
 
     def cells(self, score: str) -> list[Cell]:
-        """Cells with pairs, by rows, as tables and figures show them."""
-        lows = [0.0, 0.0, *self.distances[1:]]
+        """Cells with pairs, row by row, as tables and figures show them.
+
+        Args:
+            score: Name of the score whose quantiles are shown.
+        """
+        lows = [0.0, 0.0, *self.distances[1:]]  # of each row [m]
         highs = [0.0, *self.distances[1:]]
-        firsts = [0, *(self.separations + 1).tolist()]
+        firsts = [0, *(self.separations + 1).tolist()]  # smallest separation of each column
         lasts = [*self.separations.tolist(), math.inf]
         cells = []
         for number, scores in sorted(self.scores.items()):
             row, column = divmod(number, len(lasts))
+            low, median, high = np.quantile(scores[score].numpy(), (0.1, 0.5, 0.9)).tolist()
             cell = Cell(
                 distance=(float(lows[row]), float(highs[row])),
                 separation=(firsts[column], lasts[column]),
                 pairs=int(self.pairs[row, column]),
                 compared=len(scores[score]),
-                quantiles=tuple(np.quantile(scores[score].numpy(), (0.1, 0.5, 0.9)).tolist()),
+                quantiles=(low, median, high),
             )
             cells.append(cell)
         return cells
@@ -118,14 +124,14 @@ def measure(
         )
     order = visits(links)
     edges = distance_edges(links, places)
-    # Nine tenths of all measurements are further apart than the last limit.
+    # Largest separations of the columns: 3, 30, 300, ... up to a tenth of all measurements.
     limits = 3 * 10 ** np.arange(18)
     limits = limits[limits <= (int(order.max()) + 1) / 10]
 
-    _, first = np.unique(order, return_index=True)
-    way = places[first]  # the place of each measurement
-    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    apart = np.linalg.norm(way - way[random.permutation(len(way))], axis=1)
+    _, first_links = np.unique(order, return_index=True)
+    visited = places[first_links]  # the place of each measurement
+    steps = np.linalg.norm(np.diff(visited, axis=0), axis=1)
+    apart = np.linalg.norm(visited - visited[random.permutation(len(visited))], axis=1)
 
     shape = len(edges), len(limits) + 1
     empty = Agreement(
@@ -145,11 +151,11 @@ def measure(
 
 
 def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray, " rows"]:
-    """Upper edges of the rows of distances [m], from the spacing of places to their extent."""
+    """Upper edges [m] of the rows of a table by distance, up to the extent of the places."""
     extent = float(np.linalg.norm(np.ptp(places, 0)))
     spacing = median_spacing(links.query.transmitters.unique(dim=0))
-    edges = [np.nextafter(0, 1), round_step(spacing, 1)]
-    while edges[-1] < 1.01 * extent:  # rounding takes no distance beyond
+    edges = [np.nextafter(0, 1), round_step(spacing, 1)]  # 1, 2 or 5 times a power of ten
+    while edges[-1] < 1.01 * extent:  # 1 % for rounding errors of distances
         edges.append(round_step(1.5 * edges[-1], 1))
     return np.array(edges)
 
@@ -160,7 +166,8 @@ def visits(links: Links) -> Int[ndarray, " n"]:
     Links are in the order of the files. Consecutive links of one row (one transmission to all
     receivers) are one measurement. Later links of the same row are another measurement.
     """
-    return np.concatenate(([0], (rows_of(links).diff() != 0).numpy().cumsum()))
+    is_new = (rows_of(links).diff() != 0).numpy()  # of each link but the first
+    return np.concatenate(([0], is_new.cumsum()))
 
 
 def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
@@ -168,9 +175,10 @@ def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
     keys = [links.query.receivers.double()]
     if links.query.frequencies is not None:
         keys.append(links.query.frequencies.double())
-    _, which = torch.stack(keys, 1).unique(dim=0, return_inverse=True)
-    order = which.argsort(stable=True).numpy()
-    groups = np.split(order, which.bincount().cumsum(0)[:-1].numpy())
+    _, group_of_link = torch.stack(keys, 1).unique(dim=0, return_inverse=True)
+    by_group = group_of_link.argsort(stable=True).numpy()
+    ends = group_of_link.bincount().cumsum(0).numpy()
+    groups = np.split(by_group, ends[:-1])
     return [group for group in groups if len(group) > 1]
 
 
@@ -186,30 +194,32 @@ class Reservoir:
 
     def __init__(self, cells: int, most: int):
         self.most = most
-        self.bounds = np.ones(cells + 1)  # keys from here on are too large
+        self.bounds = np.ones(cells + 1)  # by cell: a pair with this key or a larger one is refused
         self.bounds[cells] = 0
-        self.keys = {cell: np.zeros(0) for cell in range(cells)}
-        self.ends = {cell: np.zeros((0, 2), int) for cell in range(cells)}
+        self.keys = {cell: np.zeros(0) for cell in range(cells)}  # of the kept pairs
+        self.ends = {cell: np.zeros((0, 2), int) for cell in range(cells)}  # their two links
 
     def add(self, cells: ndarray, keys: ndarray, rows: ndarray, columns: ndarray) -> None:
         """Offers all pairs of a link of ``rows`` with a link of ``columns``.
+
+        Each cell keeps the pairs with its smallest keys.
 
         Args:
             cells: Cell of each pair, row by row.
             keys: Random number of each pair in [0, 1).
         """
-        small = np.flatnonzero(keys < self.bounds[cells])
-        for cell in np.unique(cells[small]):
-            here = small[cells[small] == cell]
-            row, column = np.divmod(here, len(columns))
+        candidates = np.flatnonzero(keys < self.bounds[cells])
+        for cell in np.unique(cells[candidates]):
+            pairs = candidates[cells[candidates] == cell]
+            row, column = np.divmod(pairs, len(columns))
             ends = np.stack((rows[row], columns[column]), 1)
-            all_keys = np.concatenate((self.keys[cell], keys[here]))
+            all_keys = np.concatenate((self.keys[cell], keys[pairs]))
             all_ends = np.concatenate((self.ends[cell], ends))
-            best = np.argsort(all_keys)[: self.most]
-            self.keys[cell] = all_keys[best]
-            self.ends[cell] = all_ends[best]
-            if len(best) == self.most:
-                self.bounds[cell] = all_keys[best[-1]]
+            smallest = np.argsort(all_keys)[: self.most]
+            self.keys[cell] = all_keys[smallest]
+            self.ends[cell] = all_ends[smallest]
+            if len(smallest) == self.most:
+                self.bounds[cell] = all_keys[smallest[-1]]
 
 
 def draw(
@@ -224,7 +234,7 @@ def draw(
     """Counts the pairs of each cell, and draws up to ``most`` of them.
 
     Args:
-        agreement: Edges of the cells, and the share of links whose pairs are counted.
+        agreement: Edges of the cells, and the fraction of links whose pairs are counted.
         places: Transmitter of each link [m].
         most, block, random: As for ``measure``.
 
@@ -235,16 +245,18 @@ def draw(
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
     reservoir = Reservoir(size, most)
     for group in groups:
-        number = math.ceil(agreement.share * len(group))
-        chosen = np.sort(random.choice(len(group), number, replace=False))
+        chosen_count = math.ceil(agreement.share * len(group))
+        chosen = np.sort(random.choice(len(group), chosen_count, replace=False))
         numbers = np.arange(len(group))
         is_chosen = np.isin(numbers, chosen)
-        for part in np.array_split(chosen, math.ceil(number * len(group) / block)):
-            rows = group[part]
-            separation = np.abs(order[rows, None] - order[group])
-            cells = agreement.cell(cdist(places[rows], places[group]), separation)
+        # Chosen links (rows) by all links of the group (columns), in blocks of rows.
+        block_count = math.ceil(chosen_count * len(group) / block)
+        for chosen_block in np.array_split(chosen, block_count):
+            rows = group[chosen_block]
+            separations = np.abs(order[rows, None] - order[group])
+            cells = agreement.cell(cdist(places[rows], places[group]), separations)
             # Two chosen links meet twice, and each link meets itself.
-            cells[is_chosen & (numbers <= part[:, None])] = size
+            cells[is_chosen & (numbers <= chosen_block[:, None])] = size
             cells = cells.ravel()
             counts += np.bincount(cells, minlength=size + 1)
             reservoir.add(cells, random.random(len(cells)), rows, group)
@@ -254,16 +266,16 @@ def draw(
 
 def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]:
     """Scores of the later links' labels, with the earlier links' labels as the predictions."""
-    labels = torch.from_numpy(later).split(evaluation.BATCH)
-    others = torch.from_numpy(earlier).split(evaluation.BATCH)
-    parts = []
-    for label, other in zip(labels, others, strict=True):
-        parts.append(links.task.scores(links.labels[label], links.labels[other]))
-    return joined_scores(parts)
+    label_batches = torch.from_numpy(later).split(evaluation.BATCH)
+    prediction_batches = torch.from_numpy(earlier).split(evaluation.BATCH)
+    scores = []
+    for labels, predictions in zip(label_batches, prediction_batches, strict=True):
+        scores.append(links.task.scores(links.labels[labels], links.labels[predictions]))
+    return joined_scores(scores)
 
 
 def joined_scores(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Scores of several parts by name, joined."""
+    """Scores by name, each joined over several sets of scores."""
     scores = {}
     for name in parts[0]:
         scores[name] = torch.cat([part[name] for part in parts])

@@ -114,7 +114,11 @@ def check_suffix(file: Path) -> str:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Exports from a finished run into a folder, with the options of ``config["export"]``."""
+    """Exports from a finished run into a folder, with the options of ``config["export"]``.
+
+    Without ``places``, predictions and scenarios are for the test links. The file is named after
+    its content: ``predictions``, ``radio_map`` or ``room``.
+    """
     options = dict(config["export"])
     form, places = options.pop("format"), options.pop("places")
     if form is None:
@@ -122,7 +126,7 @@ def run(config: dict, folder: Path) -> None:
         raise ValueError(f"command=export needs export.format, one of {forms}")
     suffix = check_suffix(Path(f"export.{form}"))
     model = load(config["folder"], config["trust"])
-    # A ``.nc`` is a radio map without places, and predictions with them.
+    # For scalar labels a ``.nc`` without places is a radio map.
     takes_places = suffix in OTHER_FILES["predictions"] + OTHER_FILES["scenario"]
     has_map = suffix in MAP_FILES and model.scene.task.is_scalar
     if places is None and takes_places and not has_map:

@@ -49,19 +49,20 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     Source: OGC GeoTIFF Standard 1.1; names of bands as GDAL stores them.
     """
     x, y = axes_on_map(file, floor, scene.frame)
-    width = np.diff(x[:2])[0]
+    width = np.diff(x[:2])[0]  # of a pixel
     height = np.diff(y[:2])[0]
     kinds = layers(floor).values()
-    # Rows run from north to south.
-    upright = np.stack([kind.values[:, ::-1] for kind in kinds], 1)  # (receivers, kinds, rows, ...)
-    bands = upright.reshape(-1, len(y), len(x)).astype(np.float32)
-    words = []
-    for name in floor.receivers:
-        words += [f"{name}: {with_unit(kind.quantity, kind.unit)}" for kind in kinds]
+    # Rows of the file run from north to south, rows of the map from south to north.
+    north_up = np.stack([kind.values[:, ::-1] for kind in kinds], 1)  # (receivers, kinds, y, x)
+    bands = north_up.reshape(-1, len(y), len(x)).astype(np.float32)
+    names = []  # one for each band
+    for receiver in floor.receivers:
+        names += [f"{receiver}: {with_unit(kind.quantity, kind.unit)}" for kind in kinds]
     items = "".join(
-        f'<Item name="DESCRIPTION" sample="{band}" role="description">{escape(word)}</Item>'
-        for band, word in enumerate(words)
+        f'<Item name="DESCRIPTION" sample="{band}" role="description">{escape(name)}</Item>'
+        for band, name in enumerate(names)
     )
+    # Pixel (0, 0) begins at its north-west corner, half a pixel from its centre.
     corner = (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0)
     tags: list[tuple] = [
         (33550, "d", 3, (width, height, 0.0), True),  # ModelPixelScale
@@ -96,12 +97,13 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     kinds = layers(floor)
     # A receiver may be called "ap deviation" beside one called "ap".
     full_names = {" ".join(pair) for pair in itertools.product(floor.receivers, kinds)}
-    collide = full_names & {*floor.receivers}
+    collisions = full_names & {*floor.receivers}
     columns = {}
     for receiver, name in enumerate(floor.receivers):
         for key, kind in kinds.items():
-            full = name if key == "value" and not collide else f"{name} {key}"
-            columns[full] = kind.values[receiver].ravel().tolist()
+            is_short = key == "value" and not collisions
+            column = name if is_short else f"{name} {key}"
+            columns[column] = kind.values[receiver].ravel().tolist()
     features = []
     for row, (east, north) in enumerate(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)):
         place = [round(east, 8), round(north, 8)]  # of degrees: 1 mm
@@ -124,17 +126,17 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """
     x, y = axes_on_map(file, floor, scene.frame)
     variables = {"receiver": Variable(("receiver",), np.array(floor.receivers))}
-    standard: dict[str, dict[str, str]] = {"x": {}, "y": {}}
-    shared = {"coordinates": "z"}
+    standard_names: dict[str, dict[str, str]] = {"x": {}, "y": {}}
+    shared = {"coordinates": "z"}  # attributes of value and deviation
     if scene.frame is not None:
         system = find_pyproj().CRS.from_epsg(scene.frame.epsg).to_cf()
         variables["crs"] = Variable((), np.array(0, np.int32), system)
-        standard = {axis: {"standard_name": f"projection_{axis}_coordinate"} for axis in "xy"}
+        for axis in "xy":
+            standard_names[axis] = {"standard_name": f"projection_{axis}_coordinate"}
         shared["grid_mapping"] = "crs"
     for axis, values in (("x", x), ("y", y)):
-        variables[axis] = Variable(
-            (axis,), values, {"units": "m", "axis": axis.upper(), **standard[axis]}
-        )
+        attributes = {"units": "m", "axis": axis.upper(), **standard_names[axis]}
+        variables[axis] = Variable((axis,), values, attributes)
     variables["z"] = Variable(
         (), np.array(floor.height), {"units": "m", "long_name": "height of the transmitter"}
     )

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 class Labels(NamedTuple):
-    """The links to predict, and their test labels."""
+    """Links to predict, with their test labels if known."""
 
     query: Query
     task: Task  # task of the values; of held-out subcarriers their own
@@ -59,12 +59,11 @@ def write_predictions(
         log.warning("%s has values alone: the model has no intervals of %g here", file, interval)
         values = model.predict(query, frequencies=subcarriers)
         estimate = Estimate(values, None, None, None)  # type: ignore[arg-type]
-    absent = torch.tensor(False).expand(len(query), *task.shape)
+    absent = torch.tensor(False).expand(len(query), *task.shape)  # True for missing elements
     if task.is_channel:
-        numbers: Any = task
-        absent = lacking(
-            scene.receivers, query.receivers.cpu(), numbers.elements, numbers.frequencies
-        )
+        channel: Any = task
+        receivers = query.receivers.cpu()
+        absent = lacking(scene.receivers, receivers, channel.elements, channel.frequencies)
         estimate = Estimate(*(_blank(part, absent) for part in estimate))
         measured = _blank(measured, absent)
     variables = tabulate(query, scene, task, estimate, measured)
@@ -85,7 +84,10 @@ def write_predictions(
 
 
 def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels:
-    """The links to predict at ``places``; of ``Links`` the test links, at held-out subcarriers."""
+    """The links to predict for the ``places`` of ``write_predictions``, with labels if known.
+
+    ``Links`` give their test links. If they hold out subcarriers, these are predicted.
+    """
     query = query_of("predictions", scene, places, frequency)
     if not isinstance(places, Links):
         return Labels(query, scene.task, None, None)
@@ -97,7 +99,10 @@ def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels
 
 
 def _blank(part: Tensor | None, absent: Bool[Tensor, " n *shape"]) -> Tensor | None:
-    """Channels with NaN at missing elements of an array; other labels unchanged."""
+    """A tensor with NaN at missing elements of arrays.
+
+    None and tensors without the axes of elements and subcarriers are returned unchanged.
+    """
     if part is None or part.ndim < 3:
         return part
     return part.cpu().masked_fill(absent, math.nan)
@@ -155,14 +160,15 @@ def tabulate(
         if name in ("deviation", "radius"):
             unit = task.error_unit
         about = {"units": unit or "1", "long_name": f"{task.quantity}: {name}"}
-        # A part without some axes, such as one radius a link, is the same along them.
-        lacking_axes = len(task.shape) + 1 - part.ndim
-        of_link = part.reshape(len(part), *[1] * lacking_axes, *part.shape[1:])
-        sides = {"": of_link}
+        # A part without some axes, such as one radius a link, is the same along them: it gets these
+        # axes with length 1, and is then repeated.
+        axes_to_add = len(task.shape) + 1 - part.ndim
+        full_rank = part.reshape(len(part), *[1] * axes_to_add, *part.shape[1:])
+        components = {"": full_rank}
         if part.is_complex():
-            sides = {"_real": of_link.real, "_imag": of_link.imag}
-        for ending, side in sides.items():
-            values = side.expand(len(part), *task.shape).float().numpy()
+            components = {"_real": full_rank.real, "_imag": full_rank.imag}
+        for ending, component in components.items():
+            values = component.expand(len(part), *task.shape).float().numpy()
             variables[f"{name}{ending}"] = Variable(("link", *axes), values, about)
     return variables
 
@@ -188,31 +194,39 @@ def _link_columns(query: Query, scene: Scene) -> dict[str, Variable]:
 def _rows(
     variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
 ) -> Iterator[Sequence[str]]:
-    """A heading, and a row for each number that is not absent: link, axes, then values."""
-    of_link = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
+    """Yields the rows of a table: a heading, then one row for each number of each label.
+
+    A row has the columns of the link, the coordinates along the label's axes, such as element and
+    subcarrier, and the values there. Numbers at missing elements have no row.
+
+    Args:
+        variables: Result of ``tabulate``.
+        absent: True at missing elements.
+    """
+    link_names = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
     axes: dict[str, list] = {}
     links: dict[str, list] = {}
     values: dict[str, np.ndarray] = {}
     for name, variable in variables.items():
         if variable.dimensions == (name,):
             axes[name] = [f"{number:.10g}" for number in variable.values.tolist()]
-        elif name in of_link:
+        elif name in link_names:
             links[name] = variable.values.tolist()
         else:
             values[name] = variable.values
     digits = [10 if name in ("easting", "northing") else 7 for name in links]
-    places = [*itertools.product(*axes.values())]
+    coordinates = [*itertools.product(*axes.values())]  # of each number of a label
 
     yield [*links, *axes, *values]
     for number, link in enumerate(zip(*links.values(), strict=True)):
-        start = [*map(_shown, link, digits)]
-        parts = [map(_shown, part[number].ravel().tolist()) for part in values.values()]
-        cells = zip(places, zip(*parts, strict=True), absent[number].ravel(), strict=True)
-        for place, row, is_absent in cells:
+        link_cells = [*map(_shown, link, digits)]
+        columns = [map(_shown, array[number].ravel().tolist()) for array in values.values()]
+        rows = zip(*columns, strict=True)
+        for point, row, is_absent in zip(coordinates, rows, absent[number].ravel(), strict=True):
             if not is_absent:
-                yield [*start, *place, *row]
+                yield [*link_cells, *point, *row]
 
 
 def _shown(value: Any, digits: int = 7) -> str:
-    """A text unchanged, or a number with ``digits`` digits."""
+    """A cell of the table: a text unchanged, or a number with ``digits`` significant digits."""
     return value if isinstance(value, str) else f"{value:.{digits}g}"

@@ -48,8 +48,10 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         frequency = _carrier(mirrored, frequency)
     paths = trace_paths(placement, mirrored.traced)
     planes = outline_planes(placement, paths)
+    # Sheets, thin absorbers, replace obstacles in the box of all paths and planes. ``gain`` is the
+    # common gain of all paths that sheets do not explain [Np].
     corners = np.concatenate([paths.ends, *(plane.corners for plane in planes)])
-    sheets, rest = fit_sheets(placement, mirrored.traced, corners.min(0), corners.max(0))
+    sheets, gain = fit_sheets(placement, mirrored.traced, corners.min(0), corners.max(0))
     if suffix == ".obj":
         write_text(file, wavefront_obj(placement, paths, sheets))
         return [file]
@@ -64,12 +66,12 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     bsdfs += [sheet_bsdf(sheet) for sheet in sheets]
     comments = [f"Materials for {frequency:.7g} Hz.", *map(str, mirrored.scene.flat_axes)]
     if mirrored.scene.task.dtype.is_complex:
-        comments += _gain_comments(mirrored, rest)
+        comments += _gain_comments(mirrored, gain)
     return write_scene(file, meshes, bsdfs, comments)
 
 
 def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
-    """The carrier of a scene's materials [Hz]; a ``ValueError`` if option and data lack one."""
+    """The option ``frequency``, or else the data's carrier [Hz]; a ``ValueError`` without one."""
     if frequency is None:
         frequency = mirrored.scene.middle_frequency
     if frequency is None:
@@ -98,27 +100,29 @@ def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
 
 
 @torch.no_grad()
-def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " receivers"]:
+def traced_gains(model: MirroredSplatting, gain: float) -> Complex[Tensor, " receivers"]:
     """Factor of each receiver by which traced channels of Sionna RT become the model's channels.
 
     Args:
-        rest: Common gain of all paths from ``fit_sheets`` [Np], beside the losses in sheets, the
+        gain: Common gain of all paths from ``fit_sheets`` [Np], beside the losses in sheets, the
             thin absorbers that replace obstacles.
     """
     placement = model.placement
-    nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + rest
+    # The direct path has number 0; the mean is over bands.
+    nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + gain
     amplitudes = nepers.exp() * model.pooling.strength
     return torch.polar(amplitudes, placement.receiver_phases)
 
 
-def _gain_comments(model: MirroredSplatting, rest: float) -> list[str]:
+def _gain_comments(model: MirroredSplatting, gain: float) -> list[str]:
     """Comments of a scene: the factor that turns traced channels into each receiver's channels."""
+    # Labels in which phases have the other sign than in Sionna RT.
     conjugated = ", then conjugated" if model.pooling.array_sign > 0 else ""
-    gains = traced_gains(model, rest).tolist()
+    factors = traced_gains(model, gain).tolist()
     comments = []
-    for receiver, gain in zip(model.scene.receivers, gains, strict=True):
-        angle = math.degrees(cmath.phase(gain))
-        factor = f"{abs(gain):.4g}, turned by {angle:.2f} degrees"
+    for receiver, complex_factor in zip(model.scene.receivers, factors, strict=True):
+        angle = math.degrees(cmath.phase(complex_factor))
+        factor = f"{abs(complex_factor):.4g}, turned by {angle:.2f} degrees"
         comments.append(f"Channels of {receiver.name} are those traced times {factor}{conjugated}.")
     return comments
 
@@ -132,10 +136,11 @@ class Bsdf(NamedTuple):
 
 
 def itu_bsdf(material: Material, frequency: float) -> Bsdf:
-    """A material of ITU-R P.2040 in Sionna RT.
+    """A material of ITU-R P.2040 for Sionna RT.
 
-    Sionna RT gets its name, and computes the constants for the carrier that is set there. Outside 1
-    to 40 GHz, where Sionna RT has no table, it gets extrapolated constants.
+    From 1 to 40 GHz the material has only its name, and Sionna RT computes the constants for the
+    carrier that is set there. At other carriers, for which Sionna RT has no table, the material has
+    extrapolated constants.
 
     Args:
         material: Name and thickness.
@@ -153,8 +158,8 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
     """The material of a sheet, a thin absorber that stands for obstacles.
 
-    It transmits, and scatters the rest. Sionna RT leaves scattered power out by default, so that a
-    sheet only dims waves.
+    A sheet transmits a part of the power and scatters all else. Sionna RT leaves scattered power
+    out by default, so that a sheet only dims waves.
     """
     thickness = 1e-5  # [m]; thin against the wavelength, so that only the conductance counts
     impedance = 376.73  # of free space [ohm]
@@ -195,8 +200,10 @@ def write_scene(
             ElementTree.SubElement(shape, "ref", id=bsdf.name, name="bsdf")
         ElementTree.indent(scene)
         write_text(file, ElementTree.tostring(scene, encoding="unicode") + "\n")
-        for old in {*folder.glob("plane_*.ply"), *folder.glob("obstacle_*.ply")} - {*files}:
-            if old.stat().st_mtime < time.time() - 60:  # the scene before may still be read
+        old_meshes = {*folder.glob("plane_*.ply"), *folder.glob("obstacle_*.ply")} - {*files}
+        for old in old_meshes:
+            # For a minute a program may still read the scene before.
+            if old.stat().st_mtime < time.time() - 60:
                 old.unlink()
     return files
 

@@ -41,12 +41,13 @@ def write_scenario(
     check_empty(folder)
     receivers = mirrored.scene.receivers
     query = query_of("scenarios", mirrored.scene, places, frequency)
-    users = torch.tensor(number_places(query.transmitters.tolist())[0])  # each place once
+    distinct_places, _ = number_places(query.transmitters.tolist())
+    users = torch.tensor(distinct_places)  # (users, 3)
     carrier = mirrored.scene.task.frequencies.mean()  # type: ignore[attr-defined]
     stations = []
     for number, receiver in enumerate(receivers):
-        numbers = torch.full((len(users),), number)
-        query = Query(users, numbers, carrier.to(users).expand(len(users)))
+        receiver_numbers = torch.full((len(users),), number)
+        query = Query(users, receiver_numbers, carrier.to(users).expand(len(users)))
         bounces = trace_paths(mirrored.placement, query).bounces  # (users, paths, order, 3)
         stations.append(
             deepmimo.Station(
@@ -67,17 +68,18 @@ def write_scenario(
 def _fields(
     model: MirroredSplatting, query: Query, receiver: int, carrier: float
 ) -> Complex[ndarray, "users paths"]:
-    """Gains of the paths from users to a receiver at the carrier [Hz]; 0 for no path."""
+    """Complex gains of paths from users to a receiver at the carrier [Hz]; 0 without a path."""
     amplitudes = []
-    for part in query.parts(64):
-        part = part.to(model.placement.middle.device)
-        rows = torch.arange(len(part), device=part.receivers.device)
-        paths = model.paths(model.excite(part), rows, receiver, part)
+    for batch in query.parts(64):
+        batch = batch.to(model.placement.middle.device)
+        rows = torch.arange(len(batch), device=batch.receivers.device)
+        paths = model.paths(model.excite(batch), rows, receiver, batch)
         amplitudes.append(paths.amplitudes)
-    gains = torch.cat(amplitudes).cpu().to(torch.complex128).numpy()  # (users, paths)
-    sizes = np.abs(gains)
+    relative_gains = torch.cat(amplitudes).cpu().to(torch.complex128).numpy()  # (users, paths)
+    magnitudes = np.abs(relative_gains)
     # Weaker paths are rounding errors: float32 has seven digits of a link's strongest path.
-    faintest = 1e-6 * sizes.max(1, keepdims=True)
-    # Gains count from free space at 1 m, which has wavelength / (4 pi) (Friis).
-    unit = model.pooling.strength.item() * speed_of_light / (4 * math.pi * carrier)
-    return np.where(sizes > faintest, unit * gains, 0)
+    faintest = 1e-6 * magnitudes.max(1, keepdims=True)
+    # The model's gains are relative to free space at 1 m, whose amplitude is
+    # wavelength / (4 pi) (Friis).
+    gain_at_1_m = model.pooling.strength.item() * speed_of_light / (4 * math.pi * carrier)
+    return np.where(magnitudes > faintest, gain_at_1_m * relative_gains, 0)

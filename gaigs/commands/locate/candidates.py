@@ -72,12 +72,14 @@ class PlaceDensity:
             squares = squares.masked_fill(is_other, math.inf)
         if folds is not None:
             squares = squares.masked_fill(folds[:, None] == self.folds, math.inf)
-        # The log of: sum over known places of (1 - e) / k N(place; known, width), plus e / volume.
-        share = math.log(1 - self.elsewhere) - math.log(len(self.places))
-        peak = share - int(axes.sum()) * math.log(width * math.sqrt(2 * math.pi))
-        near = torch.logsumexp(squares / (-2 * width**2), 1) + peak  # (g,)
-        volume = self.edges[axes].prod() * max(1, len(self.floors))
-        return torch.logaddexp(near, (self.elsewhere / volume).log())
+        # The density is (1 - e) / k * sum of N(place; known place, width) + e / volume, with k
+        # known places and e = ``elsewhere``. A normal density of d axes is
+        # exp(-square / (2 width²)) / (width sqrt(2 pi))^d.
+        log_share = math.log(1 - self.elsewhere) - math.log(len(self.places))
+        log_peak = log_share - int(axes.sum()) * math.log(width * math.sqrt(2 * math.pi))
+        log_near = torch.logsumexp(squares / (-2 * width**2), 1) + log_peak  # (g,)
+        volume = self.edges[axes].prod() * max(1, len(self.floors))  # [m^d] over all floors
+        return torch.logaddexp(log_near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
         """The width [m] with the highest likelihood of known places, each given the other folds.
@@ -88,12 +90,13 @@ class PlaceDensity:
             tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
         """
         rows = evenly(torch.arange(len(self.places)), most)
-        ends = math.log10(spacing / 4), math.log10(self.edges.norm())
+        widths = torch.logspace(math.log10(spacing / 4), math.log10(self.edges.norm()), tried)
 
         def mean_logarithm(width: float) -> float:
+            """Mean log density at known places, each by the places of the other folds."""
             return self.logarithm(self.places[rows], width, self.folds[rows]).mean().item()
 
-        return max(torch.logspace(*ends, tried).tolist(), key=mean_logarithm)
+        return max(widths.tolist(), key=mean_logarithm)
 
     def _floor(self, places: Float[Tensor, "g 3"]) -> Int[Tensor, " g"]:
         """Number of the floor nearest to each place."""
@@ -107,7 +110,10 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """Candidates for ``PlaceDensity`` as prior: a quarter on a grid, the others near known places.
+    """Candidates with ``PlaceDensity`` as their prior.
+
+    A quarter of the candidates is on a grid, the others are near known places. The places of
+    validation and training links are known, at the carrier of the map.
 
     Args:
         box: Corners of the box of the grid [m].
@@ -115,11 +121,13 @@ def near_candidates(
         floors: Heights of separate floors [m]; empty for a single floor.
         known: Numbers of the known links, whose transmitters are the known places.
     """
-    places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
+    transmitters = links.query.transmitters[known].double()
+    places, place_of_link = transmitters.unique(dim=0, return_inverse=True)  # (k, 3)
     folds = torch.zeros(len(places), dtype=torch.long)
-    folds = folds.index_copy(0, which, folds_of(links, known))
+    folds = folds.index_copy(0, place_of_link, folds_of(links, known))
     edges = (box[1] - box[0]).double()
-    edges[2] *= not len(floors)
+    if len(floors):  # heights between the floors have no candidates
+        edges[2] = 0
     density = PlaceDensity(places, folds, edges, floors)
     width = density.likeliest_width(links.scene.spacing)
 
@@ -127,11 +135,13 @@ def near_candidates(
     count = points - points // 4
     steps = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
     steps = width * density.has_extent * steps
-    around = places[torch.arange(count) * len(places) // count] + steps
+    centres = torch.arange(count) * len(places) // count  # each known place equally often
+    around = places[centres] + steps
     chosen = torch.cat((even, around.float()))  # (g, 3)
 
-    # Candidates drawn from a part of the prior share this part's probability evenly.
+    # The grid samples the uniform part of the prior, the others its normal part. The samples of a
+    # part share its probability evenly.
     shares = torch.tensor([density.elsewhere / len(even), (1 - density.elsewhere) / count]).log()
     prior = shares.repeat_interleave(torch.tensor([len(even), count]))
-    logarithms = [density.logarithm(part.double(), width) for part in chosen.split(1024)]
+    logarithms = [density.logarithm(block.double(), width) for block in chosen.split(1024)]
     return Candidates(chosen, prior, torch.cat(logarithms).float())

@@ -62,7 +62,13 @@ def run(config: dict, folder: Path) -> None:
 def locate_test(
     prints: Fingerprints, links: Links, options: Mapping, folder: Path, map_seconds: float
 ) -> Location:
-    """Locates the test transmitters of a run, by predictions and by nearest neighbours."""
+    """Locates the test transmitters of a run, by predictions and by nearest neighbours.
+
+    Writes ``locate.json``, ``locate.csv`` and ``locate.png`` into the folder, and prints errors.
+
+    ``map_seconds`` is the time in which ``prints`` was made [s]. A ``ValueError`` is raised without
+    test links at its carrier.
+    """
     test = at_carrier(links, prints.frequency, "test")
     if not len(test):
         raise ValueError(
@@ -79,14 +85,14 @@ def locate_test(
     if options["unknown_power"]:
         values = without_power(values)
         known_values = without_power(known_values)
-    guess = neighbours(values, known_values, known.places, groups)
-    guesses = {
+    knn_places = neighbours(values, known_values, known.places, groups)
+    estimates = {
         "mean": location.mean,
         "median": location.median,
         "likeliest": location.likeliest,
-        "knn": guess,
+        "knn": knn_places,
     }
-    errors = {name: (places - truth).norm(dim=1) for name, places in guesses.items()}
+    errors = {name: (places - truth).norm(dim=1) for name, places in estimates.items()}
     numbers = summary(location, truth, errors, options["level"])
     numbers["locate"]["milliseconds"] = 1e3 * seconds / len(truth)
     numbers |= {
@@ -99,7 +105,7 @@ def locate_test(
     }
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "locate.json", json.dumps(numbers, indent=2) + "\n")
-    columns = coordinates(truth) | location.columns() | coordinates(guess, "knn_")
+    columns = coordinates(truth) | location.columns() | coordinates(knn_places, "knn_")
     columns |= {f"{name}_error": error for name, error in errors.items()}
     write_columns(folder / "locate.csv", columns)
     drawn = error_figure(truth, location.mean, known.places, errors)
@@ -140,5 +146,5 @@ def summary(
 
 
 def coordinates(places: Float[Tensor, "n 3"], prefix: str = "") -> dict[str, Tensor]:
-    """Columns of places by the names of their axes."""
+    """Columns x, y and z of places [m] by name, such as ``knn_x`` with the prefix ``knn_``."""
     return {f"{prefix}{axis}": places[:, k] for k, axis in enumerate("xyz")}

@@ -20,7 +20,7 @@ from gaigs.report import style
 
 
 class Cells(NamedTuple):
-    """Cells of a map."""
+    """Square cells of a map from above, and places to count in them."""
 
     # Their edges [m].
     x: Float[ndarray, " columns1"]
@@ -41,7 +41,8 @@ class Cells(NamedTuple):
         # The map of a corridor has at least 15 % of its length as its width.
         margin = np.maximum(0, 0.15 * (extent.max() or 1.0) - extent) / 2
         low, high = low - margin, high + margin
-        pitch = math.sqrt((high - low).prod() / min(most, len(places) / 8))
+        # At least eight candidates a cell on average, so that their sums vary little.
+        pitch = math.sqrt((high - low).prod() / min(most, len(places) / 8))  # edge of a cell [m]
         x = np.arange(low[0], high[0] + pitch, pitch)
         y = np.arange(low[1], high[1] + pitch, pitch)
         return cls(x, y, places)
@@ -64,8 +65,9 @@ def posterior_figure(location: Location, level: float | None = None) -> Figure:
 def draw_posterior(axis: Axes, location: Location, label: str) -> None:
     """Draws the probability of cells; for a single transmission also its region with ``label``."""
     cells = Cells.around(location.places[:, :2].double().numpy())
+    probabilities = location.probabilities.mean(0).double().numpy()  # mean over transmissions
     # Smooth over neighbouring cells: they hold different numbers of candidates.
-    chances = gaussian_filter(cells.sums(location.probabilities.mean(0).double().numpy()), 1)
+    chances = gaussian_filter(cells.sums(probabilities), 1)
     image = axis.pcolormesh(cells.x, cells.y, 100 * chances, cmap="Blues", rasterized=True)
     title = "probability of a cell [%]"
     axis.figure.colorbar(image, ax=axis, location="bottom", shrink=0.7, aspect=30, label=title)
@@ -86,13 +88,14 @@ def plot_location(result: Location, ax: Any = None) -> Any:
 
 
 def outline(axis: Axes, cells: Cells, location: Location, label: str) -> None:
-    """Draws the region of a single transmission."""
+    """Draws the outline of the region of a single transmission, named ``label`` in the legend."""
     counts = cells.sums(location.region[0].double().numpy())
+    # A smooth outline around cells with a candidate of the region.
     inside = gaussian_filter((counts > 0).astype(float), 1)
     x = (cells.x[1:] + cells.x[:-1]) / 2
     y = (cells.y[1:] + cells.y[:-1]) / 2
     axis.contour(x, y, inside, [0.3 * inside.max()], colors=style.GREY, linewidths=0.8)
-    axis.plot([], [], color=style.GREY, lw=0.8, label=label)
+    axis.plot([], [], color=style.GREY, lw=0.8, label=label)  # a contour has no legend entry
 
 
 def error_figure(
@@ -124,11 +127,11 @@ def error_figure(
         above.plot(x[1], y[1], "o", markersize=3, color=style.ORANGE, label="estimates")
         above.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
-        parts = ((torch.arange(len(truth)) + 0.5) / len(truth)).numpy()
-        neighbours, _ = style.looks(["knn"])["knn"]
+        fractions = ((torch.arange(len(truth)) + 0.5) / len(truth)).numpy()
+        knn_colour, _ = style.looks(["knn"])["knn"]
         sorted_errors = {name: errors[name].sort().values.numpy() for name in ("mean", "knn")}
-        shares.plot(sorted_errors["mean"], parts, color=style.ORANGE, label="estimates")
-        shares.plot(sorted_errors["knn"], parts, color=neighbours, label="nearest neighbours")
+        shares.plot(sorted_errors["mean"], fractions, color=style.ORANGE, label="estimates")
+        shares.plot(sorted_errors["knn"], fractions, color=knn_colour, label="nearest neighbours")
         shares.set(xlabel="error [m]", ylabel="share of transmitters", ylim=(0, 1), xlim=(0, None))
         shares.grid()
         shares.set_axisbelow(True)

@@ -22,8 +22,8 @@ class LocatedFold(NamedTuple):
     """Held-out fingerprints of a fold, located in the map of a model trained without them."""
 
     candidates: Candidates  # candidates of this map
-    # Log likelihoods at them, with known and with unknown power. Their degrees and temper are
-    # chosen without these fingerprints.
+    # Log likelihoods of the candidates, with known and with unknown power. Their degrees and temper
+    # are chosen without these fingerprints.
     likelihoods: Float[Tensor, "2 n g"]
     truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
@@ -95,10 +95,12 @@ class Fingerprints:
                     is_received = torch.ones(len(order), dtype=torch.bool)
                     candidates, logarithms = track(candidates, logarithms[order], step, is_received)
                     truth = truth[order]
-                # Candidates are a sample of the prior: their density is not their probability.
-                heights = logarithms - candidates.prior + candidates.density  # (n, g)
+                # Posterior density = likelihood times prior density. ``prior`` is the probability
+                # of a candidate, which is no density: candidates are a sample of the prior.
+                log_densities = logarithms - candidates.prior + candidates.density  # (n, g)
                 nearest = candidates.nearest(truth)[:, None]
-                drops.append(heights.amax(1) - heights.gather(1, nearest)[:, 0])
+                at_truth = log_densities.gather(1, nearest)[:, 0]  # (n,)
+                drops.append(log_densities.amax(1) - at_truth)
             self._drops[unknown_power, step] = torch.cat(drops).sort().values
         return self._drops[unknown_power, step]
 
@@ -121,22 +123,24 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
 
 def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
     """The transmissions of the links ``index``, with the labels of these links only."""
-    rows, which = rows_of(links)[index].unique(return_inverse=True)
-    labels = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
+    rows, transmission_of_link = rows_of(links)[index].unique(return_inverse=True)
+    # ``rows``: numbers of the transmissions. Blocks, as labels may be read from a file.
+    blocks = [links.task.fingerprint(links.labels[block]) for block in index.split(256)]
+    labels = torch.cat(blocks)  # (k, m)
     values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
-    values[which, links.query.receivers[index]] = labels
+    values[transmission_of_link, links.query.receivers[index]] = labels
     places = torch.zeros(len(rows), 3)
-    places[which] = links.query.transmitters[index]
+    places[transmission_of_link] = links.query.transmitters[index]
     return Transmissions(values, places)
 
 
 def receptions(
     links: Links, index: Int[Tensor, " k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
-    """Places of n transmissions [m], and 1 for each receiver with a link, otherwise 0."""
-    rows, which = rows_of(links)[index].unique(return_inverse=True)
+    """Places of n transmissions [m], and for each receiver 1 if it has a link ``index``, else 0."""
+    rows, transmission_of_link = rows_of(links)[index].unique(return_inverse=True)
     places = torch.zeros(len(rows), 3)
-    places[which] = links.query.transmitters[index]
+    places[transmission_of_link] = links.query.transmitters[index]
     is_received = torch.zeros(len(rows), len(links.receivers))
-    is_received[which, links.query.receivers[index]] = 1
+    is_received[transmission_of_link, links.query.receivers[index]] = 1
     return places, is_received

@@ -14,10 +14,10 @@ from gaigs.core.query import ROUNDING, evenly
 
 
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
-    """Axes (in columns) along which the errors of a label's m values are independent.
+    """Axes (columns of the result) along which the errors of a label's m values are independent.
 
     Squared errors of a label along these axes sum to 1 on average. At most ``most`` labels are
-    used, at even steps.
+    used, at even steps. If all errors are 0, the axes are unit vectors.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.
@@ -25,15 +25,22 @@ def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor,
     errors = errors[evenly(torch.arange(len(errors)), most)].double()
     if not errors.any():
         return torch.eye(errors.shape[1])
-    sizes, vectors = torch.linalg.eigh(errors.mT @ errors / len(errors))
-    # Shrink the covariance towards a multiple of the identity, by its own scatter (section 3).
-    scatter = (errors.square().sum(1).square().mean() - sizes.square().sum()) / len(errors)
-    spread = (sizes - sizes.mean()).square().sum()
-    share = (scatter / spread).nan_to_num(1.0).clamp(0, 1)  # 0 / 0 if all are equal
-    sizes = (1 - share) * sizes.clamp_min(0) + share * sizes.mean()
-    # Numbers that never err get no infinite weight.
-    axes = vectors / sizes.clamp_min(1e-6 * sizes.max()).sqrt()
-    return (axes / (errors @ axes).square().sum(1).mean().sqrt()).float()
+    covariance = errors.mT @ errors / len(errors)  # (m, m)
+    variances, vectors = torch.linalg.eigh(covariance)
+    # The covariance S shrinks to (1 - b²/d²) S + b²/d² v I with its mean variance v (section 3).
+    # Only its eigenvalues change. b² = (mean |error|⁴ - |S|²) / n is the variance of S as an
+    # estimate, d² = |S - v I|² its distance from v I.
+    mean = variances.mean()
+    fourth_powers = errors.square().sum(1).square()  # (n,)
+    estimate_variance = (fourth_powers.mean() - variances.square().sum()) / len(errors)
+    squared_distance = (variances - mean).square().sum()
+    ratio = estimate_variance / squared_distance
+    shrinkage = ratio.nan_to_num(1.0).clamp(0, 1)  # 0 / 0 if all variances are equal
+    variances = (1 - shrinkage) * variances.clamp_min(0) + shrinkage * mean
+    # The lower bound keeps the weight of values finite that are always predicted exactly.
+    axes = vectors / variances.clamp_min(1e-6 * variances.max()).sqrt()
+    mean_square = (errors @ axes).square().sum(1).mean()
+    return (axes / mean_square.sqrt()).float()
 
 
 class Mismatch(NamedTuple):
@@ -41,7 +48,8 @@ class Mismatch(NamedTuple):
 
     squares: Float[Tensor, "n g"]  # sum of squared errors over squared deviations
     log_deviations: Float[Tensor, "n g"]  # sum of the logarithms of the deviations
-    counts: Float[Tensor, " n"]  # number of receivers that give evidence of the place
+    # Number of receivers with a value; with unknown power of scalar labels one less.
+    counts: Float[Tensor, " n"]
     # Logarithm of the probability that these receivers receive the value and no other does; 0 for
     # unknown power.
     reception: Float[Tensor, "n g"]
@@ -69,10 +77,11 @@ def mismatch(
     counts = is_received.float().sum(1)
     reception = torch.zeros_like(squares)
     if not unknown_power:
-        likely = is_received.float() @ prints.reception_probabilities.log().mT
-        unlikely = (~is_received).float() @ (-prints.reception_probabilities).log1p().mT
+        probabilities = prints.reception_probabilities  # (g, r)
+        log_received = is_received.float() @ probabilities.log().mT  # (n, g)
+        log_missed = (~is_received).float() @ (-probabilities).log1p().mT  # sums of log(1 - p)
         # In a track, a transmission that no receiver has received may not have been sent.
-        reception = (likely + unlikely) * (counts > 0)[:, None]
+        reception = (log_received + log_missed) * (counts > 0)[:, None]
     elif not prints.task.shape:
         counts = counts - 1  # the fitted offset takes one degree of freedom
     return Mismatch(squares.clamp_min(0), log_deviations, counts, reception)
@@ -84,26 +93,30 @@ def _level_squares(
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"]]:
-    """``Mismatch.squares`` and ``Mismatch.log_deviations`` for scalar labels."""
-    total = torch.zeros(len(received), len(prints.values))
-    log_deviations = torch.zeros_like(total)
-    errors_sum = torch.zeros_like(total)
-    weights_sum = torch.zeros_like(total)
+    """``Mismatch.squares`` and ``Mismatch.log_deviations`` for scalar labels.
+
+    Sums over the receivers of each transmission, with error e and standard deviation s of each. An
+    unknown power is an offset c of all errors: min over c of sum ((e - c) / s)² is
+    sum (e / s)² - (sum e / s²)² / sum 1 / s².
+    """
+    squares = torch.zeros(len(received), len(prints.values))  # sums of (e / s)²
+    log_deviations = torch.zeros_like(squares)  # sums of log s
+    weighted_errors = torch.zeros_like(squares)  # sums of e / s²
+    weights = torch.zeros_like(squares)  # sums of 1 / s²
     for receiver in range(received.shape[1]):
         rows = is_received[:, receiver]
-        values = prints.values[:, receiver]
+        values = prints.values[:, receiver]  # (g, 1)
         smallest = ROUNDING * values.abs().max()  # for labels without any error
-        deviations = prints.deviations[:, receiver].clamp_min(smallest)
-        errors = (received[rows, receiver] - values[:, 0]) / deviations  # (k, g)
-        total[rows] += errors.square()
-        errors_sum[rows] += errors / deviations
-        weights_sum[rows] += deviations.square().reciprocal()
+        deviations = prints.deviations[:, receiver].clamp_min(smallest)  # (g,)
+        scaled_errors = (received[rows, receiver] - values[:, 0]) / deviations  # (k, g)
+        squares[rows] += scaled_errors.square()
+        weighted_errors[rows] += scaled_errors / deviations
+        weights[rows] += deviations.square().reciprocal()
         log_deviations[rows] += deviations.log()
     if unknown_power:
-        # min over c of sum ((e - c) / s)² = sum (e / s)² - (sum e / s²)² / sum 1 / s²
-        tiny = torch.finfo(torch.float32).tiny
-        total = total - errors_sum.square() / weights_sum.clamp_min(tiny)
-    return total, log_deviations
+        tiny = torch.finfo(torch.float32).tiny  # for transmissions without a receiver
+        squares = squares - weighted_errors.square() / weights.clamp_min(tiny)
+    return squares, log_deviations
 
 
 def _array_squares(
@@ -112,29 +125,34 @@ def _array_squares(
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> Float[Tensor, "n g"]:
-    """``Mismatch.squares`` for labels of several values."""
-    products = torch.zeros(len(received), len(prints.values))
-    predicted_powers = torch.zeros_like(products)
-    powers = torch.zeros(len(received), 1)
+    """``Mismatch.squares`` for labels of several values.
+
+    The received values x and the predicted values y of all receivers are two vectors. Their squared
+    distance is x² - 2 x y + y². If the power is unknown, the best factor of y comes first.
+    """
+    products = torch.zeros(len(received), len(prints.values))  # x y
+    predicted_powers = torch.zeros_like(products)  # y², of the receivers with a value
+    powers = torch.zeros(len(received), 1)  # x²
     for receiver in range(received.shape[1]):
         rows = is_received[:, receiver]
-        values = prints.values[:, receiver]
+        values = prints.values[:, receiver]  # (g, k)
         products[rows] += received[rows, receiver] @ values.mT
         predicted_powers[rows] += values.square().sum(1)
         powers[rows] += received[rows, receiver].square().sum(1, keepdim=True)
     if not unknown_power:
-        # (x - y)² = x² - 2 x y + y²
         return predicted_powers - 2 * products + powers
-    # The part of the value that no factor of the prediction gives: 1 - (x y)² / (x² y²).
+    # min over factors f >= 0 of (x - f y)² / x² is 1 - cos², with cos² = (x y)² / (x² y²). The mean
+    # predicted power of the candidates gives it the scale of squared errors.
     tiny = torch.finfo(torch.float32).tiny
-    cosines = products.clamp_min(0).square() / (predicted_powers * powers).clamp_min(tiny)
-    return predicted_powers.mean(1, keepdim=True) * (1 - cosines)
+    squared_cosines = products.clamp_min(0).square() / (predicted_powers * powers).clamp_min(tiny)
+    return predicted_powers.mean(1, keepdim=True) * (1 - squared_cosines)
 
 
 def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float[Tensor, "n g"]:
     """Log likelihood of g candidates for n received fingerprints.
 
-    It is the log density of Student's t over all receivers, plus the log probability of reception.
+    The log density of Student's t over all r receivers, plus the log probability of reception:
+    log P - temper ((freedom + r) / 2 log(1 + squares / freedom) + log deviations).
 
     Args:
         difference: Errors of the received fingerprints.
@@ -143,8 +161,9 @@ def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float
             since they are then less evidence than independent errors.
     """
     exponent = (freedom + difference.counts[:, None]) / 2
-    together = exponent * torch.log1p(difference.squares / freedom) + difference.log_deviations
-    return (difference.reception - temper * together).double()
+    logarithms = exponent * torch.log1p(difference.squares / freedom)  # (n, g)
+    negative_log_density = logarithms + difference.log_deviations  # of Student's t
+    return (difference.reception - temper * negative_log_density).double()
 
 
 class UnseenPrints(NamedTuple):
@@ -168,11 +187,13 @@ class UnseenPrints(NamedTuple):
         logarithms = log_likelihood(self.differences[0], freedom, temper) + prior
         probabilities = torch.softmax(logarithms, 1)
         rng = torch.Generator().manual_seed(0)
-        drawn = places[torch.multinomial(probabilities, draws, True, generator=rng)]  # (n, d, 3)
-        # E |X - x| - E |X - X'| / 2
-        apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
-        errors = (drawn - self.truth[:, None]).norm(dim=2).mean(1)
-        return (errors - apart / 2).sum().item()
+        numbers = torch.multinomial(probabilities, draws, True, generator=rng)  # (n, draws)
+        samples = places[numbers]  # (n, draws, 3)
+        # E |X - x| - E |X - X'| / 2, with samples X and X' and the true place x. Consecutive
+        # samples are the pairs X, X'.
+        spreads = (samples[:, ::2] - samples[:, 1::2]).norm(dim=2).mean(1)  # (n,)
+        errors = (samples - self.truth[:, None]).norm(dim=2).mean(1)  # (n,)
+        return (errors - spreads / 2).sum().item()
 
 
 def choose_likelihood(
@@ -185,8 +206,9 @@ def choose_likelihood(
     """The map with the likelihood that gives held-out fingerprints the lowest energy score.
 
     Two numbers are chosen: the degrees of freedom of Student's t, and the exponent (``temper``) of
-    its likelihood. The fingerprints in ``held`` calibrate regions, so they must not influence their
-    own likelihood. The likelihood of each fold is therefore chosen by the other folds.
+    its likelihood. The held-out fingerprints also calibrate regions (``Fingerprints.held``). For
+    that, the other folds choose the likelihood of each fold, since a fingerprint must not influence
+    its own likelihood.
 
     Args:
         prints: The map of the model that knows all training links.
@@ -210,11 +232,13 @@ def choose_likelihood(
     scores = torch.tensor(rows)  # (folds, choices)
     total = scores.sum(0)
     held = []
-    for trial, score in zip(trials, scores, strict=True):
+    for trial, fold_scores in zip(trials, scores, strict=True):
         # The other folds choose; a single fold has to choose for itself.
-        others = total - score if len(trials) > 1 else score
-        choice = choices[int(others.argmin())]
-        likelihoods = [log_likelihood(part, *choice).float() for part in trial.differences]
+        scores_of_others = total - fold_scores if len(trials) > 1 else fold_scores
+        freedom, temper = choices[int(scores_of_others.argmin())]
+        likelihoods = []  # with known and with unknown power
+        for difference in trial.differences:
+            likelihoods.append(log_likelihood(difference, freedom, temper).float())
         held.append(LocatedFold(trial.prints.candidates, torch.stack(likelihoods), trial.truth))
     best_freedom, best_temper = choices[int(total.argmin())]
     return replace(prints, degrees=best_freedom, temper=best_temper, held=tuple(held))

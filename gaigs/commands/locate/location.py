@@ -87,7 +87,7 @@ class Location:
 
 
 def joined(parts: Sequence[Location]) -> Location:
-    """Several locations of the same candidates joined into one."""
+    """One location with all transmissions of several, which have the same candidates."""
     fields = {}
     for name in ("probabilities", "mean", "median", "likeliest", "region", "sizes"):
         fields[name] = torch.cat([getattr(part, name) for part in parts])

@@ -36,29 +36,33 @@ def neighbours(
         groups: Group of each known fingerprint, such as its place.
         most: Largest number of known transmissions that choose the number of neighbours.
     """
-    least = known[~known.isnan()].min() if known.shape[2] == 1 else 0.0
-    filled = known.where(~known.isnan(), least).flatten(1)  # (k, r m)
+    is_scalar = known.shape[2] == 1
+    replacement = known[~known.isnan()].min() if is_scalar else 0.0
+    complete_known = known.where(~known.isnan(), replacement).flatten(1)  # (k, r m)
     chosen = evenly(torch.arange(len(known)), most)
-    apart = torch.cdist(filled[chosen], filled)
-    apart = apart.masked_fill(groups[chosen][:, None] == groups, torch.inf)
+    distances = torch.cdist(complete_known[chosen], complete_known)  # (chosen, k)
+    is_same_group = groups[chosen][:, None] == groups
+    distances = distances.masked_fill(is_same_group, torch.inf)
 
-    def error(count: int) -> float:
-        return (weighted_mean(apart, places, count) - places[chosen]).norm(dim=1).mean().item()
+    def mean_error(count: int) -> float:
+        """Mean error [m] of the chosen known transmissions, located by ``count`` neighbours."""
+        located = weighted_mean(distances, places, count)
+        return (located - places[chosen]).norm(dim=1).mean().item()
 
-    count = min(COUNTS, key=error)
-    complete = values.where(~values.isnan(), least).flatten(1)  # (n, r m)
-    return weighted_mean(torch.cdist(complete, filled), places, count)
+    count = min(COUNTS, key=mean_error)
+    complete_values = values.where(~values.isnan(), replacement).flatten(1)  # (n, r m)
+    return weighted_mean(torch.cdist(complete_values, complete_known), places, count)
 
 
 def weighted_mean(
-    apart: Float[Tensor, "n k"], places: Float[Tensor, "k 3"], count: int
+    distances: Float[Tensor, "n k"], places: Float[Tensor, "k 3"], count: int
 ) -> Float[Tensor, "n 3"]:
-    """Means of the ``count`` nearest places, weighted by 1 / distance.
+    """Mean places of the ``count`` most similar fingerprints, weighted by 1 / distance.
 
     Args:
-        apart: Distances of n fingerprints from the fingerprints at k places.
+        distances: Distances of n fingerprints from the fingerprints at k places.
     """
-    nearest = apart.topk(min(count, apart.shape[1]), largest=False)
-    weights = 1 / nearest.values.clamp_min(1e-6)
+    nearest = distances.topk(min(count, distances.shape[1]), largest=False)
+    weights = 1 / nearest.values.clamp_min(1e-6)  # (n, count)
     shares = weights / weights.sum(1, keepdim=True)
     return (places[nearest.indices] * shares[..., None]).sum(1)

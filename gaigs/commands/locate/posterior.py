@@ -107,7 +107,8 @@ def excess_of(
             range of the predictions is plausible, too.
     """
     lowest, highest = prints.values.aminmax()
-    excess = torch.maximum(values - highest, lowest - values).nan_to_num(0).max()
+    excesses = torch.maximum(values - highest, lowest - values)  # (n, r, 1)
+    excess = excesses.nan_to_num(0).max()  # NaN: not received
     allowed = max(deviations * prints.deviations.max(), (highest - lowest) / 2)
     return excess.item() if excess > allowed else None
 
@@ -119,7 +120,7 @@ def posterior(
     step: float | None,
     level: float,
 ) -> Location:
-    """The location of fingerprints ``values``, by the options of ``locate``.
+    """Places and regions of transmissions from their fingerprints, by the options of ``locate``.
 
     Each of the n transmissions has m values at each receiver, from ``Task.fingerprint``.
 
@@ -135,32 +136,36 @@ def posterior(
     step = step if len(values) > 1 else None  # one value is no track
     drop = conformal_drop(prints, unknown_power, step, level)
     is_calibrated = prints.held_out_count >= fewest(level)
+    # Blocks limit memory: the steps below take 60 bytes for each transmission and candidate, the
+    # result 9. A track needs all of its transmissions at once.
+    block_size = 64 if step is None else len(values)
     locations = []
-    # In parts: a transmission takes 60 bytes a candidate, its posterior 9. A track is one part.
-    for part in values.split(64 if step is None else len(values)):
-        difference = mismatch(prints, part @ prints.axes, unknown_power)
+    for block in values.split(block_size):
+        difference = mismatch(prints, block @ prints.axes, unknown_power)
         candidates = prints.candidates
-        logarithms = log_likelihood(difference, prints.degrees, prints.temper) + candidates.prior
+        log_likelihoods = log_likelihood(difference, prints.degrees, prints.temper)  # (n, g)
+        log_posterior = log_likelihoods + candidates.prior  # up to a constant
         if step is not None:
-            is_received = ~part.isnan().all((1, 2))
-            candidates, logarithms = track(candidates, logarithms, step, is_received)
-        locations.append(located(candidates, logarithms, level, drop, is_calibrated))
+            is_received = ~block.isnan().all((1, 2))
+            candidates, log_posterior = track(candidates, log_posterior, step, is_received)
+        locations.append(located(candidates, log_posterior, level, drop, is_calibrated))
     return replace(joined(locations), frame=prints.frame)
 
 
 def conformal_drop(
     prints: Fingerprints, unknown_power: bool, step: float | None, level: float
 ) -> Float[Tensor, ""] | None:
-    """Drop of the log density from its maximum to the edge of a region.
+    """Drop of the log posterior density from its maximum to the edge of a region.
 
     A region has all candidates within this drop, so that it holds the transmitter with probability
-    ``level``. Held-out fingerprints determine the drop; it is None without them.
+    ``level``. Held-out fingerprints determine the drop; without them the result is None.
     """
-    drops = prints.drops(unknown_power, step)
+    drops = prints.drops(unknown_power, step)  # ascending
     count = prints.held_out_count
     if not count:
         return None
-    # Split conformal prediction: the quantile level (n + 1) / n of n held-out values.
+    # Split conformal prediction takes the quantile level (n + 1) / n of n held-out values. In a
+    # track they are repeated, so that there are more drops than values.
     rank = math.ceil(level * (count + 1) / count * len(drops))
     return drops[min(rank, len(drops)) - 1]
 
@@ -175,6 +180,7 @@ def located(
     """Places and regions of n transmissions.
 
     Args:
+        candidates: The g candidate places.
         logarithms: Logarithms of the posteriors, up to a constant for each transmission.
         level: Probability with which a region holds the transmitter.
         drop: Drop of the log density to the edge of a region, from ``conformal_drop``; None: the
@@ -183,17 +189,21 @@ def located(
     """
     places = candidates.places
     probabilities = torch.softmax(logarithms, 1)
-    # Posterior density: candidates are a sample of the prior, and denser where it is higher.
-    heights = logarithms - candidates.prior + candidates.density  # (n, g)
-    order = heights.argsort(1, descending=True)
-    # The highest densities that hold the level together.
+    # Posterior density = likelihood times prior density. ``prior`` is the probability of a
+    # candidate, which is no density: candidates are denser where transmitters are likelier.
+    log_densities = logarithms - candidates.prior + candidates.density  # (n, g)
+    order = log_densities.argsort(1, descending=True)
+    # The highest densities that hold the level together: a candidate is inside if the candidates
+    # above it hold less.
     ordered = probabilities.gather(1, order)
     is_inside = ordered.cumsum(1) - ordered < level
     region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, is_inside)
     if drop is not None:
-        near = heights >= heights.gather(1, order[:, :1]) - drop
-        region = near if is_calibrated else near | region
-    medians = [geometric_median(places, part) for part in probabilities.split(64)]
+        highest = log_densities.gather(1, order[:, :1])  # (n, 1)
+        is_within_drop = log_densities >= highest - drop
+        region = is_within_drop if is_calibrated else is_within_drop | region
+    # Blocks limit the memory of distances.
+    medians = [geometric_median(places, block) for block in probabilities.split(64)]
     return Location(
         places,
         probabilities,
@@ -215,6 +225,8 @@ def geometric_median(
     """Places with the lowest mean distance from the candidates, for each row of probabilities.
 
     Args:
+        places: Candidates [m].
+        probabilities: Weights of the candidates in the mean.
         tolerance: Largest change of a coordinate in the last step [m]. Smaller distances count as
             this distance, since a candidate may coincide with the median.
 
@@ -224,7 +236,8 @@ def geometric_median(
     places = places.double()
     median = probabilities @ places
     for _ in range(steps):
-        weights = probabilities / distances(median, places).clamp_min(tolerance)
+        # Weiszfeld's step: the mean of the places with weights probability / distance.
+        weights = probabilities / distances(median, places).clamp_min(tolerance)  # (n, g)
         previous = median
         median = weights @ places / weights.sum(1, keepdim=True)
         if (median - previous).abs().max() < tolerance:

@@ -97,7 +97,7 @@ def fingerprints(
 
 
 def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
-    """Corners of a region [m]; without a region, of the box of the training transmitters."""
+    """Corners of the region [m], or of the box of the training transmitters if it is None."""
     if region is None:
         return torch.stack((model.scene.lower, model.scene.upper))
     box = as_positions("region", region).reshape(-1, 3)
@@ -116,13 +116,13 @@ def affordable_points(
     fewest: int = 1000,
     seconds: float = 60.0,
 ) -> int:
-    """Number of candidate places that a model predicts in ``seconds``, in given limits."""
+    """Number of places that a model predicts in ``seconds``, from ``fewest`` to ``most``."""
     places = even_places(box[0], box[1], 512)
     predicted(model, places[:2], frequency)  # the first prediction compiles and loads
     start = time.perf_counter()
     predicted(model, places, frequency)
-    taken = time.perf_counter() - start
-    return min(most, max(fewest, int(seconds * len(places) / taken)))
+    places_a_second = len(places) / (time.perf_counter() - start)
+    return min(most, max(fewest, int(seconds * places_a_second)))
 
 
 class Predicted(NamedTuple):
@@ -133,28 +133,31 @@ class Predicted(NamedTuple):
 
 
 def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | None) -> Predicted:
-    """Predictions of a model at places [m] and a carrier [Hz]."""
+    """Fingerprints that a model predicts for transmitters at places [m] and a carrier [Hz]."""
     task = model.scene.task
     count = len(model.scene.receivers)
-    size = 8192
-    if task.shape:  # a look-up reads its labels once a batch
-        size = 64 if model.is_trained else 512
-    options: dict[str, Any] = {"frequency": frequency, "batch_size": size}
+    batch_size = 8192  # links
+    if task.shape:  # arrays take more memory; a look-up reads all its known labels for each batch
+        batch_size = 64 if model.is_trained else 512
+    options: dict[str, Any] = {"frequency": frequency, "batch_size": batch_size}
     values = []
     deviations = []
     # Candidates may lie outside the box of the training transmitters.
     with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):
-        for part in stages.track(places.split(max(1, size // count)), "fingerprints"):
-            transmitters = part[:, None].expand(-1, count, 3)
-            receivers = torch.arange(count).expand(len(part), -1)
+        batches = places.split(max(1, batch_size // count))
+        for batch in stages.track(batches, "fingerprints"):
+            shape = len(batch), count
+            transmitters = batch[:, None].expand(-1, count, 3)  # (places, receivers, 3)
+            receivers = torch.arange(count).expand(shape)
             if task.shape:
-                value = model.predict(transmitters, receivers, **options).cpu().flatten(0, 1)
-                deviations.append(torch.ones(len(part), count))
+                labels = model.predict(transmitters, receivers, **options).cpu().flatten(0, 1)
+                deviations.append(torch.ones(shape))
             else:
+                # An interval brings the standard deviation, whatever its level.
                 estimate = model.predict(transmitters, receivers, interval=0.5, **options)
-                value = estimate.value.cpu().flatten()
+                labels = estimate.value.cpu().flatten()
                 deviations.append(estimate.std.cpu())
-            values.append(task.fingerprint(value).unflatten(0, (len(part), count)))
+            values.append(task.fingerprint(labels).unflatten(0, shape))
     return Predicted(torch.cat(values), torch.cat(deviations))
 
 
@@ -169,7 +172,11 @@ class MapMaker:
     links: Links | None = None  # links with a split; None for a map of the model alone
 
     def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
-        """The map of a model trained on ``known`` links; each label value is an axis."""
+        """The map of a model trained on ``known`` links (their indices).
+
+        Its ``axes`` are unit vectors, until ``along`` replaces them. Its candidates are a grid, or
+        lie near the known places if there are links and no region.
+        """
         scene = model.scene
         if self.is_region:
             candidates = even_candidates(self.box, self.points)
@@ -180,8 +187,10 @@ class MapMaker:
         values, deviations = predicted(model, candidates.places, self.frequency)
         reception_probabilities = torch.full(values.shape[:2], 0.5)
         if len(known) and self.has_whole_transmissions():
-            parts = receptions(self.links, known)
-            reception_probabilities = reception_probability(candidates.places, *parts, prior=0.5)
+            known_places, is_received = receptions(self.links, known)
+            reception_probabilities = reception_probability(
+                candidates.places, known_places, is_received, prior=0.5
+            )
         return Fingerprints(
             scene.task,
             self.frequency,
@@ -219,7 +228,7 @@ class PrintFold(NamedTuple):
     errors: Float[Tensor, "k r m"]
 
     def half(self, number: int) -> "PrintFold":
-        """Every second fingerprint, starting with the first (0) or the second (1)."""
+        """The fold with every second fingerprint, from the first (0) or the second (1) on."""
         return PrintFold(self.prints, *(part[number::2] for part in self[1:]))
 
 
@@ -236,21 +245,24 @@ def held_out_folds(
     A single fold is halved, so that each half calibrates the other.
     """
     links = maker.links
+    rows = rows_of(links)  # number of each link's transmission
     folds: list[PrintFold] = []
-    for unseen, part, others in stages.track(model.unseen(links), "folds", model.fold_count):
+    # Each fold: a model without the held-out links, and the indices of these and its own links.
+    for unseen, held_out, trained in stages.track(model.unseen(links), "folds", model.fold_count):
         unseen.calibration = model.calibration
-        # Known links of a transmission that has a link in the part are held out with it.
-        rows = rows_of(links)
-        values, truth = transmissions(links, known[torch.isin(rows[known], rows[part])])
+        # All known links of a transmission are held out if one of them is.
+        is_held_out = torch.isin(rows[known], rows[held_out])
+        values, truth = transmissions(links, known[is_held_out])
         chosen = evenly(torch.arange(len(truth)), most)
-        others = others[torch.isin(others, known)]
-        if len(chosen) and (len(others) or maker.is_region):
+        trained = trained[torch.isin(trained, known)]
+        if len(chosen) and (len(trained) or maker.is_region):
             errors = values[chosen] - predicted(unseen, truth[chosen], maker.frequency).values
             if maker.is_region:  # values to locate come from the region
                 chosen = chosen[maker.contains(truth[chosen])]
-            prints = maker.make(unseen, others)
+            prints = maker.make(unseen, trained)
             folds.append(PrintFold(prints, values[chosen], truth[chosen], errors))
-        if sum(min(len(fold.truth), located) for fold in folds) >= enough:
+        located_count = sum(min(len(fold.truth), located) for fold in folds)
+        if located_count >= enough:
             break
     if len(folds) == 1 and len(folds[0].values) > 1:
         return [folds[0].half(0), folds[0].half(1)]
@@ -261,9 +273,10 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
     """Up to ``most`` held-out fingerprints of each fold, compared with the fold's map."""
     trials = []
     for number, fold in enumerate(folds):
-        # Along the axes of their own errors, fingerprints would be too near their predictions.
-        others = [other.errors for other in (*folds[:number], *folds[number + 1 :])]
-        prints = along(fold.prints, others)
+        # Axes come from the other folds: axes from the errors of a fold would make just these
+        # errors look small.
+        errors_of_others = [other.errors for other in (*folds[:number], *folds[number + 1 :])]
+        prints = along(fold.prints, errors_of_others)
         chosen = evenly(torch.arange(len(fold.truth)), most)
         if len(chosen):
             values = fold.values[chosen] @ prints.axes
@@ -283,6 +296,6 @@ def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fin
         return replace(prints, axes=torch.eye(1))
     if not errors:
         errors = [prints.values - prints.values.mean(0)]
-    values = torch.cat([*errors]).flatten(0, 1)  # (n r, m)
-    axes = independent(values[~values.isnan().any(1)])
+    label_errors = torch.cat([*errors]).flatten(0, 1)  # (n r, m)
+    axes = independent(label_errors[~label_errors.isnan().any(1)])
     return replace(prints, axes=axes, values=prints.values @ axes)

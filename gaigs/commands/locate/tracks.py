@@ -14,25 +14,31 @@ from gaigs.kriging.links import distances
 def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
     """Numbers of the places in the order of a walk, which always goes to the nearest new place.
 
-    Each number is repeated as often as a transmitter with moves of ``step`` would transmit on its
-    way to the next place. Repeats have equal errors, as fingerprints at nearby places do.
+    All numbers are repeated equally often: as often as a transmitter with moves of ``step`` would
+    transmit on the way to the next place. Repeats have equal errors, as fingerprints at nearby
+    places do.
 
     Args:
+        places: Places to visit, beginning with the first [m].
         step: Standard deviation of a move along each axis [m].
         most: Largest number of repetitions.
     """
-    apart = distances(places, places)
-    is_free = torch.ones(len(places), dtype=torch.bool)
-    is_free[0] = False
+    pair_distances = distances(places, places)
+    is_new = torch.ones(len(places), dtype=torch.bool)
+    is_new[0] = False
     order = [0]
-    moves = []
-    while is_free.any():
-        move, following = apart[order[-1]].masked_fill(~is_free, math.inf).min(0)
-        is_free[following] = False
+    walked = []  # distance of each move [m]
+    while is_new.any():
+        to_new = pair_distances[order[-1]].masked_fill(~is_new, math.inf)
+        distance, following = to_new.min(0)
+        is_new[following] = False
         order.append(int(following))
-        moves.append(move)
-    stays = round(float(torch.stack(moves).median()) / (step * math.sqrt(3))) if moves else 1
-    return torch.tensor(order).repeat_interleave(min(max(1, stays), most))
+        walked.append(distance)
+    repeats = 1
+    if walked:
+        typical_move = step * math.sqrt(3)  # root mean square over three axes
+        repeats = round(float(torch.stack(walked).median()) / typical_move)
+    return torch.tensor(order).repeat_interleave(min(max(1, repeats), most))
 
 
 def track(
@@ -45,6 +51,7 @@ def track(
     """The posterior of a track by ``smoothed``, over every m-th candidate to save time.
 
     Args:
+        candidates: The g candidate places of a transmission.
         logarithms: Log posterior of each transmission alone.
         step, is_received: See ``smoothed``.
         spread: Number of the remaining candidates over which the posterior of one transmission
@@ -53,16 +60,19 @@ def track(
     Returns:
         The j candidates, and the log posterior of the track at them.
     """
-    # The inverse sum of squared probabilities: among c equally likely candidates it is c.
+    # Number of likely candidates, by the inverse sum of squared probabilities: among c equally
+    # likely candidates it is c.
     posteriors = torch.softmax(logarithms[is_received], 1)
-    count = posteriors.square().sum(1).reciprocal().median()
-    even = torch.arange(0, len(candidates.places), max(1, int(count / spread)))
-    part = Candidates(*(column[even] for column in candidates))
+    likely_count = posteriors.square().sum(1).reciprocal().median()
+    stride = max(1, int(likely_count / spread))
+    remaining = torch.arange(0, len(candidates.places), stride)  # (j,)
+    thinned = Candidates(*(column[remaining] for column in candidates))
     # Single precision halves the time; across a room it moves the mean by less than a micrometre.
-    single = logarithms[:, even]  # (n, j)
-    single = (single - single.amax(1, keepdim=True)).float()
-    places = (part.places - part.places.mean(0)).float()
-    return part, smoothed(single, places, step, is_received).to(logarithms)
+    # Logarithms below a maximum of 0 and places about their mean keep their digits.
+    log_posteriors = logarithms[:, remaining]  # (n, j)
+    log_posteriors = (log_posteriors - log_posteriors.amax(1, keepdim=True)).float()
+    places = (thinned.places - thinned.places.mean(0)).float()
+    return thinned, smoothed(log_posteriors, places, step, is_received).to(logarithms)
 
 
 class Moves:
@@ -80,20 +90,27 @@ class Moves:
 
     def take(
         self,
-        logarithm: Float[Tensor, " k"],
+        log_probabilities: Float[Tensor, " k"],
         start: Int[Tensor, " k"],
         end: Int[Tensor, " k"],
     ) -> Float[Tensor, " k"]:
-        """Logarithms of probabilities after one move, at candidates ``end`` from ``start``."""
-        # The logarithm is of a number above 0, as each move may be a jump.
-        return (self._densities(start, end) @ (logarithm - logarithm.max()).exp()).log()
+        """Log probabilities of the candidates ``end`` after one move, up to a constant.
+
+        Args:
+            log_probabilities: Log probabilities of the candidates ``start`` before the move.
+            start, end: Numbers of candidates.
+        """
+        probabilities = (log_probabilities - log_probabilities.max()).exp()
+        # All sums are above 0, as each move may be a jump.
+        return (self._densities(start, end) @ probabilities).log()
 
     def _densities(self, start: Int[Tensor, " k"], end: Int[Tensor, " k"]) -> Float[Tensor, "k k"]:
         """Densities of moves from candidates ``start`` (columns) to ``end`` (rows).
 
-        The unit is the density of not moving.
+        The unit is the density of not moving: exp(-distance² / (2 step²)) + jump. The last result
+        is cached, since repeated transmissions of a walk have equal candidates.
         """
-        if self._last is not None:  # a walk may stay
+        if self._last is not None:
             first, second, densities = self._last
             if torch.equal(first, start) and torch.equal(second, end):
                 return densities
@@ -126,10 +143,11 @@ def smoothed(
 
     Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
     """
-    apart = distances(straight_lines(logarithms, places, is_received), places)  # (n, g)
-    preference = torch.where(is_received[:, None], logarithms, -apart)
+    # Each transmission keeps its k likeliest candidates, a missed one the nearest to its line.
+    line_distances = distances(straight_lines(logarithms, places, is_received), places)  # (n, g)
+    preference = torch.where(is_received[:, None], logarithms, -line_distances)
     indices = preference.topk(min(most, len(places)), dim=1).indices  # (n, k)
-    single = logarithms.gather(1, indices)  # (n, k)
+    alone = logarithms.gather(1, indices)  # (n, k), log posterior given each transmission alone
 
     # Moves are at least as wide as the candidates are apart.
     first = places[indices[0]]
@@ -137,13 +155,14 @@ def smoothed(
     moves = Moves(places, math.hypot(step, spacing.item()), jump)
 
     # forward: log posterior given the transmissions up to each one; backward: given later ones.
-    forward = [single[0]]  # n of (k,)
-    for value, pair in zip(single[1:], itertools.pairwise(indices), strict=True):
-        forward.append(value + moves.take(forward[-1], *pair))
-    backward = [torch.zeros_like(single[0])]
+    forward = [alone[0]]  # n of (k,)
+    for current, (before, here) in zip(alone[1:], itertools.pairwise(indices), strict=True):
+        forward.append(current + moves.take(forward[-1], before, here))
+    backward = [torch.zeros_like(alone[0])]  # from the last transmission to the first
     reversed_pairs = itertools.pairwise(indices.flip(0))
-    for value, pair in zip(single.flip(0), reversed_pairs, strict=False):
-        backward.append(moves.take(value + backward[-1], *pair))
+    # The first transmission has none before it to move to.
+    for current, (here, before) in zip(alone.flip(0), reversed_pairs, strict=False):
+        backward.append(moves.take(current + backward[-1], here, before))
     posterior = torch.stack(forward) + torch.stack(backward[::-1])
     return torch.full_like(logarithms, -math.inf).scatter(1, indices, posterior)
 
@@ -158,11 +177,13 @@ def straight_lines(
     A received transmission is at its likeliest candidate. Missed transmissions divide the line
     between the two received ones around them into equal parts.
     """
-    received = is_received.nonzero()[:, 0]
+    received = is_received.nonzero()[:, 0]  # (r,), ascending
     numbers = torch.arange(len(is_received))
+    # Positions in ``received`` of the next and the last received transmission (n,). They are equal
+    # for a received one, and for those before the first or after the last.
     after = torch.searchsorted(received, numbers).clamp_max(len(received) - 1)
     before = (torch.searchsorted(received, numbers, right=True) - 1).clamp_min(0)
-    likeliest = places[logarithms[received].argmax(1)]
+    likeliest = places[logarithms[received].argmax(1)]  # (r, 3)
     gaps = (received[after] - received[before]).clamp_min(1)
-    shares = ((numbers - received[before]) / gaps).clamp(0, 1)[:, None]
+    shares = ((numbers - received[before]) / gaps).clamp(0, 1)[:, None]  # (n, 1) of the way
     return torch.lerp(likeliest[before], likeliest[after], shares.to(places))

@@ -32,8 +32,9 @@ def as_fingerprints(
     is_missing = numbers.isnan().any(2)
     if values.is_complex():
         is_missing |= (numbers == 0).all(2)
-    is_silent = is_missing.all(1)
-    if is_silent.all() if is_track else is_silent.any():
+    is_silent = is_missing.all(1)  # (n,)
+    is_refused = is_silent.all() if is_track else is_silent.any()
+    if is_refused:
         raise ValueError(
             f"value {int(is_silent.int().argmax())} was heard by no receiver; leave it out, "
             "or give step of a track"
@@ -50,12 +51,13 @@ def in_order(value: Mapping, prints: Fingerprints) -> Tensor:
     """Labels in the order of the receivers, from labels by name; NaN for names that are missing."""
     if not value:
         raise ValueError("value must have the label of one receiver or more, got none")
-    which = as_receivers([*value], prints.receivers)
+    receivers = as_receivers([*value], prints.receivers)  # numbers of the named receivers
     expected = "a label, or as many labels, of each receiver"
     labels = as_tensor("value", [*value.values()], expected).detach().cpu()
     dtype = torch.promote_types(labels.dtype, torch.float32)
     ordered = torch.full((len(prints.receivers), *labels.shape[1:]), math.nan, dtype=dtype)
-    ordered[which] = labels.to(dtype)
+    ordered[receivers] = labels.to(dtype)
+    # Several transmissions: from (r, n, *shape) to (n, r, *shape).
     is_several = labels.ndim == 2 + len(prints.task.shape)
     return ordered.transpose(0, 1) if is_several else ordered
 
@@ -73,7 +75,7 @@ def as_values(value: object, prints: Fingerprints) -> Tensor:
     if count == 1 and is_label and values.ndim <= 1 + len(shape):
         values = values.reshape(-1, 1, *shape)  # the only receiver has no axis
     elif values.ndim == 1 + len(shape):
-        values = values[None]
+        values = values[None]  # a single transmission
     if values.ndim != 2 + len(shape) or values.shape[1:] != (count, *shape) or not len(values):
         need = f"{(count, *shape)} or {('n', count, *shape)}, a label of each receiver"
         raise ValueError(f"value must be {need}, got {tuple(given.shape)}")

@@ -63,20 +63,27 @@ def plot_plan(result: SitePlan, ax: Any = None) -> Any:
 def draw_map(
     axis: Axes, plan: SitePlan, values: Float[Tensor, " g"], new: Float[Tensor, "n 3"] | None = None
 ) -> Any:
-    """Draws values from above, the mean over heights, with receivers; returns the image."""
+    """Draws values from above with receivers, and returns the image.
+
+    Args:
+        values: The objective at each place of ``plan.area``; a map cell is the mean over heights.
+        new: Positions of new access points [m]; None: they are not drawn.
+    """
     x, columns = np.unique(plan.area[:, 0].numpy(), return_inverse=True)
     y, rows = np.unique(plan.area[:, 1].numpy(), return_inverse=True)
-    cells = rows * len(x) + columns  # of a grid, so each has as many heights
+    cells = rows * len(x) + columns  # the area is a grid, so each cell has a place at each height
     means = np.bincount(cells, values.numpy()) / np.bincount(cells)
-    shown = plan.qualities[[0, -1] if len(plan.standing) else [-1]]
-    ends = (0, 100) if plan.objective == "coverage" else (float(shown.min()), float(shown.max()))
+    low, high = 0.0, 100.0
+    if plan.objective != "coverage":  # both maps have the same colours
+        displayed = plan.qualities[[0, -1] if len(plan.standing) else [-1]]
+        low, high = float(displayed.min()), float(displayed.max())
     colours = "viridis_r" if plan.objective == "locate" else "viridis"  # bright is good
-    look = {"cmap": colours, "vmin": ends[0], "vmax": ends[1], "rasterized": True}
+    look = {"cmap": colours, "vmin": low, "vmax": high, "rasterized": True}
     image = axis.pcolormesh(x, y, means.reshape(len(y), len(x)), shading="nearest", **look)
     dots = {"linestyle": "none", "markeredgecolor": "white", "clip_on": False, "markersize": 8}
     if len(plan.standing):
-        stands = plan.standing[:, :2].T.numpy()
-        axis.plot(*stands, "^", label="stand already", color=style.GREY, **dots)
+        standing_x, standing_y = plan.standing[:, :2].T.numpy()
+        axis.plot(standing_x, standing_y, "^", label="stand already", color=style.GREY, **dots)
     if new is not None:
         label = "new, in this order"
         axis.plot(*new[:, :2].T.numpy(), "o", label=label, color=style.ORANGE, **dots)

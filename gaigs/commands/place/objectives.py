@@ -32,9 +32,12 @@ class Coverage:
         self.thresholds = values.new_tensor([threshold])  # (t,)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
-        """Probability that each reading is below each threshold; these multiply over a set."""
-        above = self.thresholds - self.values[index, :, None]  # (k, g, t)
-        return torch.special.ndtr(above / self.deviations[index, :, None])
+        """Probability that each reading of k receivers is below each threshold.
+
+        The product over a set of receivers is the probability that all are below.
+        """
+        margins = self.thresholds - self.values[index, :, None]  # (k, g, t)
+        return torch.special.ndtr(margins / self.deviations[index, :, None])
 
     def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
         """Quality of each place from the product of the factors of a set [%]."""
@@ -63,11 +66,12 @@ class MeanLevel(Coverage):
 class LocationError:
     """Root mean square error of a location by the readings of all receivers [m].
 
-    The expected likelihood of a place y' for readings at y is a product over receivers of normal
-    densities of the difference of means (Jebara, Kondor and Howard, Probability product kernels,
-    2004). With these likelihoods as weights, half the mean square distance is the variance of the
-    location. If readings are linear in the place, this is the Cramér-Rao bound. Distant places with
-    the same readings also count, unlike in the bound.
+    Readings at place y give place y' an expected likelihood. It is the product over receivers of
+    N(m - m'; 0, s² + s'²), with means m, m' and standard deviations s, s' of a reading at the two
+    places (Jebara, Kondor and Howard, Probability product kernels, 2004). With these likelihoods as
+    weights of the places y', half the mean square distance from y is the variance of the location.
+    If readings are linear in the place, this is the Cramér-Rao bound. Distant places with the same
+    readings also count, unlike in the bound.
 
     Args:
         values, deviations: As for ``Coverage``.
@@ -87,17 +91,19 @@ class LocationError:
         self.squares = torch.cdist(places, places).square().to(values)  # (g, g)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g g"]:
-        """Expected likelihood between two places at each receiver; these multiply over a set."""
-        means, variances = self.values[index], self.deviations[index].square()
-        variances = variances[:, :, None] + variances[:, None]  # (k, g, g)
-        apart = means[:, :, None] - means[:, None]
-        # A constant of each receiver has no effect; with this one no factor is above 1.
-        scale = variances.amin((1, 2), keepdim=True)
-        return (scale / variances).sqrt() * torch.exp(-apart.square() / (2 * variances))
+        """Expected likelihood of each place (last axis) for readings at each place, by receiver."""
+        means = self.values[index]  # (k, g)
+        variances = self.deviations[index].square()
+        sums = variances[:, :, None] + variances[:, None]  # s² + s'², (k, g, g)
+        differences = means[:, :, None] - means[:, None]  # m - m'
+        # A constant factor of a receiver has no effect; with this one no factor is above 1.
+        scale = sums.amin((1, 2), keepdim=True)
+        return (scale / sums).sqrt() * torch.exp(-differences.square() / (2 * sums))
 
     def quality(self, products: Float[Tensor, "*sets g g"]) -> Float[Tensor, "*sets g"]:
-        """Quality of each place, from products of factors [m]."""
-        return ((products * self.squares).sum(-1) / products.sum(-1) / 2).sqrt()
+        """Error of the location at each place [m], from products of factors over a set."""
+        mean_squares = (products * self.squares).sum(-1) / products.sum(-1)  # (*sets, g)
+        return (mean_squares / 2).sqrt()
 
 
 def choose(
@@ -114,18 +120,21 @@ def choose(
         rule: The objective, with existing receivers first and possible ones after them.
 
     Returns:
-        The chosen receivers, and the quality of each place before and after each choice.
+        Numbers of the chosen receivers, the best first, and the quality of each place before and
+        after each choice.
     """
-    rows = torch.arange(len(rule.values))
-    before, candidates = rows[:standing], rows[standing:]
-    members, score = extend(rule, before, candidates, count)
+    numbers = torch.arange(len(rule.values))
+    existing, candidates = numbers[:standing], numbers[standing:]
+    members, score = extend(rule, existing, candidates, count)  # existing ones first
     unchanged = 0  # receivers that stayed since the last exchange
     while unchanged < count:
-        others = torch.cat((before, members[standing + 1 :]))
+        # The earliest chosen receiver leaves, and the best candidate, perhaps the same, is added.
+        others = torch.cat((existing, members[standing + 1 :]))
         members, new_score = extend(rule, others, candidates, 1)
         unchanged = 0 if new_score > score + 1e-9 else unchanged + 1
         score = max(score, new_score)
-    members, _ = extend(rule, before, members[standing:], count)
+    # The same set, in the greedy order.
+    members, _ = extend(rule, existing, members[standing:], count)
     products = [product_of(rule, members[:end]) for end in range(standing, len(members) + 1)]
     return members[standing:], torch.stack([rule.quality(product) for product in products])
 
@@ -145,24 +154,27 @@ def extend(
         most: Largest number of values of ``rule.factors`` in memory at a time.
 
     Returns:
-        The larger set and its score, the mean quality over places; higher is better.
+        The larger set and its score: the mean quality over places, negative if lower is better.
     """
     score = -torch.inf
     for _ in track(range(count), "receivers to place"):
         free = candidates[~torch.isin(candidates, members)]
         product = product_of(rule, members)
+        block_size = max(1, most // product.numel())
         means = []
-        for part in free.split(max(1, most // product.numel())):
-            means.append(rule.sign * rule.quality(product * rule.factors(part)).mean(-1))
-        ranked = torch.cat(means)
-        members = torch.cat((members, free[ranked.argmax()][None]))
-        score = ranked.max().item()
+        for block in free.split(block_size):
+            qualities = rule.quality(product * rule.factors(block))  # (block, g)
+            means.append(rule.sign * qualities.mean(-1))
+        scores = torch.cat(means)  # of the set with each free candidate
+        members = torch.cat((members, free[scores.argmax()][None]))
+        score = scores.max().item()
     return members, score
 
 
 def product_of(rule: Coverage | LocationError, members: Int[Tensor, " k"]) -> Float[Tensor, "g t"]:
     """The product of the factors of a set's receivers; ones for an empty set."""
-    product = torch.ones_like(rule.factors(torch.zeros(1, dtype=torch.int64))[0])
+    shape_source = rule.factors(torch.zeros(1, dtype=torch.int64))[0]  # of any receiver
+    product = torch.ones_like(shape_source)
     for receiver in members[:, None]:
         product = product * rule.factors(receiver)[0]
     return product

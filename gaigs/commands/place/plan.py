@@ -70,21 +70,22 @@ class SitePlan:
 
     def __str__(self) -> str:
         more = " more" if len(self.standing) else ""
-        subject = f"{len(self.places)}{more} bring{'s' * (len(self.places) == 1)}"
+        verb = "brings" if len(self.places) == 1 else "bring"
+        subject = f"{len(self.places)}{more} {verb}"
         digits = 2 if self.objective == "locate" else 1
         first, last = (f"{score:.{digits}f}" for score in self.scores[[0, -1]].tolist())
         if self.objective == "coverage":
-            start = f"{first} to " * (len(self.standing) > 0)
+            start = f"{first} to " if len(self.standing) else ""
             return f"{subject} {start}{last} % above {self.threshold:g} {self.unit}".rstrip()
-        what = "mean best level" if self.objective == "mean" else "expected error of locations"
+        quantity = "mean best level" if self.objective == "mean" else "expected error of locations"
         start = "" if first == "nan" else f"from {first} "
-        return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
+        return f"{subject} the {quantity} {start}to {last} {self.score_unit}".rstrip()
 
     def save(self, path: str | Path) -> None:
         """Writes a CSV table: existing receivers, then new places, each with the score after it."""
-        rows = [("stands", place, None) for place in self.standing.tolist()]
-        pairs = zip(self.places.tolist(), self.scores[1:].tolist(), strict=True)
-        rows += [("place", *pair) for pair in pairs]
+        rows = [("stands", position, None) for position in self.standing.tolist()]
+        new = zip(self.places.tolist(), self.scores[1:].tolist(), strict=True)
+        rows += [("place", position, score) for position, score in new]
         write_places(Path(path), self.objective, rows, self.frame)
 
 
@@ -153,15 +154,18 @@ def place(
     standing = scene.positions(area) if known else area[:0]
     frequency = scene.middle_frequency if frequency is None else frequency
 
-    parts = []
+    rows = []
+    deviation_rows = []
+    # Existing receivers by number, then candidates by position.
     for receiver in track([*range(len(standing)), *sites], "predicted receivers"):
         # An interval brings the deviation, whatever its level.
         estimate = model.predict(area, receiver=receiver, frequency=frequency, interval=0.5)
-        parts.append(torch.stack(estimate[:2]).double().cpu())  # (2, g)
-    values, deviations = torch.stack(parts, 1)  # (k + c, g) each
-    chosen, qualities = choose(rules[objective](values, deviations), len(standing), count)
+        rows.append(estimate.value.double().cpu())  # (g,)
+        deviation_rows.append(estimate.std.double().cpu())
+    rule = rules[objective](torch.stack(rows), torch.stack(deviation_rows))  # (k + c, g) each
+    chosen, qualities = choose(rule, len(standing), count)
     if objective == "mean" and not len(standing):
-        qualities[0] = math.nan
+        qualities[0] = math.nan  # no receiver, no level
     return SitePlan(
         sites[chosen - len(standing)],
         standing,
@@ -183,14 +187,18 @@ def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float
     """
     if candidates is not None and np.ndim(candidates):
         return as_positions("candidates", candidates).reshape(-1, 3)
-    x, y = torch.stack(scene.box)[:, :2].T.numpy()
-    corners = np.stack((x[[0, 1, 1, 0, 0]], y[[0, 0, 1, 1, 0]]))  # (2, 5), once around
-    lengths = np.append(0, np.hypot(*np.diff(corners)).cumsum())  # (5,) on the way
-    spacing = lengths[-1] / usual if candidates is None else candidates
-    if not lengths[-1] / 10_000 <= spacing < np.inf:
-        least = f"{lengths[-1] / 10_000:.2g}"
+    x, y = torch.stack(scene.box)[:, :2].T.numpy()  # lower and upper coordinate of each
+    corners_x = x[[0, 1, 1, 0, 0]]  # once around, back to the first corner
+    corners_y = y[[0, 0, 1, 1, 0]]
+    sides = np.hypot(np.diff(corners_x), np.diff(corners_y))
+    walked = np.append(0, sides.cumsum())  # way from the first corner to each [m]
+    perimeter = walked[-1]
+    spacing = perimeter / usual if candidates is None else candidates
+    if not perimeter / 10_000 <= spacing < np.inf:
+        least = f"{perimeter / 10_000:.2g}"
         raise ValueError(f"candidates must be {least} m apart or more, got {candidates} m")
-    walk = np.arange(0, lengths[-1] - 1e-6, spacing)
-    rim = [np.interp(walk, lengths, corner) for corner in corners]
-    height = np.full(len(walk), scene.positions(scene.lower)[:, 2].median())
-    return torch.from_numpy(np.stack((*rim, height), 1)).float()
+    ways = np.arange(0, perimeter - 1e-6, spacing)  # the end is the first place again
+    wall_x = np.interp(ways, walked, corners_x)
+    wall_y = np.interp(ways, walked, corners_y)
+    height = np.full(len(ways), scene.positions(scene.lower)[:, 2].median())
+    return torch.from_numpy(np.stack((wall_x, wall_y, height), 1)).float()

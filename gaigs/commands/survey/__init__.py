@@ -31,12 +31,12 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SurveyPlan) -> Figure:
-    """A figure of places from above and, if it falls, of the error after each new place."""
+    """A figure of places from above, and of the error after each new place if the error falls."""
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         # A flat curve says no more than the text.
-        falls = plan.errors is not None and plan.errors[-1] < 0.98 * plan.errors[0]
-        count = 2 if falls else 1
+        has_curve = plan.errors is not None and plan.errors[-1] < 0.98 * plan.errors[0]
+        count = 2 if has_curve else 1
         axes = drawn.subplots(1, count, squeeze=False)[0]
         draw_places(axes[0], plan)
         drawn.legend(loc="outside lower left", ncols=3)
@@ -78,11 +78,12 @@ def draw_places(axis: Axes, plan: SurveyPlan) -> None:
 
 
 def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
-    """Draws the expected error after each new place; the axis spans at least 5 % of it."""
+    """Draws the expected error after each new place; the y axis spans at least 5 % of the error."""
     label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
     axis.plot(plan.errors.numpy(), color=style.BLUE)
     first, last = plan.errors.max().item(), plan.errors.min().item()
-    # The axis begins at the data: a fall that matters is seen, and a flat line has its numbers.
+    # The axis begins near the data, so that a small fall is seen. Its smallest span keeps a flat
+    # line from looking steep.
     rim = max(0.1 * (first - last), 0.025 * first)
     axis.set(xlabel="new places", ylabel=label, ylim=(last - rim, first + rim))
     # No number of places lowers the error below this.

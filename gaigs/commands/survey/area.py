@@ -34,6 +34,7 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
     """
     frame = None if model is None else model.scene.frame
     outlines = [rings for rings, _ in read_polygons(file, frame, "draw the area")]
+    # Corners of all outer and inner rings; the height is NaN where the file has none.
     corners = np.concatenate([*itertools.chain.from_iterable(outlines)])  # (k, 3)
     heights = corners[:1, 2]
     if model is not None and np.isnan(corners[:, 2]).any():
@@ -53,11 +54,18 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
 def _places_inside(
     polygons: list[Rings], corners: Float[ndarray, "k 2"], count: int
 ) -> Float[ndarray, "g 2"]:
-    """About ``count`` evenly spread places within polygons; if none is inside, a corner."""
+    """Evenly spread places within polygons, at least half of ``count`` if possible.
+
+    If no place of the finest grid is inside, the result is the first corner.
+
+    Args:
+        polygons: An outer ring each, then its holes.
+        corners: Corners of all rings [m].
+    """
     lower = torch.tensor([*corners.min(0), 0.0])
     upper = torch.tensor([*corners.max(0), 0.0])
-    tried = count
-    for _ in range(6):  # a narrow area is a small part of its box
+    tried = count  # places of a grid over the box of all polygons
+    for _ in range(6):  # a narrow area is a small part of its box: double the grid
         places = even_places(lower, upper, tried)[:, :2].numpy()
         is_inside = np.zeros(len(places), dtype=bool)
         for outline, *holes in polygons:

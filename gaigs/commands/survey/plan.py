@@ -74,9 +74,10 @@ class SurveyPlan:
             return (
                 f"{count} places to measure first; without a trained model their error is unknown"
             )
-        few = int(self.superfluous.sum())
+        superfluous = int(self.superfluous.sum())
         left_out = (
-            f"{few} of {len(self.known)} measured places could have been left out for 5 % more"
+            f"{superfluous} of {len(self.known)} measured places could have been left out "
+            "for 5 % more"
         )
         now, last = (f"{error:.3g} {self.unit}".rstrip() for error in self.errors[[0, -1]])
         scatter = f"{self.scatter:.3g} {self.unit}".rstrip()
@@ -92,9 +93,11 @@ class SurveyPlan:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: places to measure with the error after each, then those to leave out.
+        """Writes a CSV table: places to measure, then places to leave out.
 
-        With a ``frame`` it has easting and northing too. Without a model errors are empty.
+        A place to measure has the mean error after its measurement, a place to leave out the mean
+        error without it. Without a model errors are empty. With a ``frame`` the table has easting
+        and northing too.
         """
         errors = [None] * len(self.places) if self.errors is None else self.errors[1:].tolist()
         rows = [("measure", *row) for row in zip(self.places.tolist(), errors, strict=True)]
@@ -134,11 +137,12 @@ def survey(
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region and receivers most.
 
-    A receiver counts at a place by its probability of reception, from the measured places around.
-    Labels affect a plan only through the fitted process, so new measurements need not be known. The
-    place of largest variance would be a poor choice, since it is in a corner. Places are at least
-    half a correlation length apart, as long as there is room. The first places of a longer plan are
-    the shorter plan. A plan ends when the noise of labels is nearly the whole error.
+    The mean is weighted by the probability that a receiver receives from a place, estimated from
+    the measured places around it. A variance depends on where measurements are, not on their
+    labels, so a whole plan can be made before any new measurement. The place of largest variance
+    would be a poor choice, since it is in a corner. Places are at least half a correlation length
+    apart, as long as there is room. The first places of a longer plan are the shorter plan. A plan
+    ends when the noise of labels is nearly the whole error.
 
     Args:
         model: ``gaussian_process``, or a trained model with kriging. None: nothing is measured yet,
@@ -190,20 +194,22 @@ def survey(
         process = default_process(everywhere)
         selection = Selection([process], everywhere, places, mean_absolute(1.0))
         chosen, _ = selection.choose(count)
-        none = places.candidates[:0]
-        return SurveyPlan(places.candidates[chosen], None, none, none[:, 0], none[:, 0].bool())
+        no_places = places.candidates[:0]
+        losses = no_places[:, 0]
+        return SurveyPlan(places.candidates[chosen], None, no_places, losses, losses.bool())
 
     everywhere = coordinates_of(model, places.all, frequency).to(processes[0].places)
-    centres: Sequence = [None] * len(processes)
+    trend_centres: Sequence = [None] * len(processes)
     if model.scene.task.is_scalar:  # levels fall with the distance from the receiver
-        centres = model.scene.positions(everywhere)
+        trend_centres = model.scene.positions(everywhere)
     spacing = Spacing(processes, everywhere[: len(places.candidates)])
-    pairs = zip(processes, centres, strict=True)
-    processes = [with_trend(*pair) for pair in pairs]
+    # After the spacing, as a trend correlates all places.
+    pairs = zip(processes, trend_centres, strict=True)
+    processes = [with_trend(process, centre) for process, centre in pairs]
     factor = error_factor(model)
     selection = Selection(processes, everywhere, places, factor)
     scatter = selection.scatter()
-    chosen, errors = selection.choose(count, spacing, scatter / (1 - stop))
+    chosen, errors = selection.choose(count, spacing, enough=scatter / (1 - stop))
     # Measured places count over the region, or the whole room if there are candidates alone.
     evaluated = everywhere[places.evaluated]
     if region is None and candidates is not None:
@@ -224,7 +230,7 @@ def survey(
 
 
 class SurveyPlaces(NamedTuple):
-    """Places of a survey."""
+    """Candidates of a survey, and places over which its error is stated."""
 
     candidates: Float[Tensor, "c 3"]  # places that can be measured [m]
     # Places over which the error is stated [m]; if empty, it is stated over the candidates.
@@ -242,9 +248,13 @@ class SurveyPlaces(NamedTuple):
 
 
 def survey_places(model: Model | None, region: object, candidates: object) -> SurveyPlaces:
-    """Candidates and other places from the arguments of ``survey``; a ``ValueError`` if none."""
-    none = torch.zeros(0, 3)
-    even = none
+    """Candidates and other places from the arguments of ``survey``.
+
+    Raises:
+        ValueError: There is neither model nor region nor candidates, or the region is no box.
+    """
+    no_places = torch.zeros(0, 3)
+    even = no_places
     if region is not None:
         box = as_positions("region", region).reshape(-1, 3)
         if len(box) != 2:
@@ -262,7 +272,7 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
             )
         even = training_grid(model)
     if candidates is None:
-        return SurveyPlaces(even, none)
+        return SurveyPlaces(even, no_places)
     return SurveyPlaces(as_positions("candidates", candidates).reshape(-1, 3), even)
 
 
@@ -273,6 +283,7 @@ def training_grid(model: Model) -> Float[Tensor, "g 3"]:
 
 def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
     """Raises a ``ValueError`` unless all receivers' covariances take at most ``limit`` bytes."""
+    # A receiver has candidates² numbers of 8 bytes.
     most = int((limit / 8 / max(1, receivers)) ** 0.5)
     if not 0 < candidates <= most:
         raise ValueError(
@@ -293,17 +304,21 @@ def coordinates_of(
 
 
 def mean_absolute(deviation: float) -> float:
-    """Mean absolute value of a normal variable."""
+    """Mean absolute value of a normal variable with mean 0 and a standard deviation."""
     return math.sqrt(2 / math.pi) * deviation
 
 
 def error_factor(model: Model) -> float:
-    """Mean absolute error of a label over the standard deviation that the model states."""
+    """Ratio of a label's mean absolute error to the standard deviation that the model states.
+
+    Without calibration the ratio is that of a normal variable.
+    """
     calibration = model.calibration
     if calibration is None:
         return mean_absolute(1.0)
     if not model.scene.task.is_scalar:
         return calibration.mean_error
+    # ``sizes`` are root mean squares of held-out errors over stated standard deviations, by group.
     return mean_absolute(calibration.sizes.square().mean().sqrt().item())
 
 
@@ -311,10 +326,10 @@ class Selection:
     """The choice of candidates, one by one, by the posterior covariances of all receivers.
 
     Args:
-        processes: Process of each receiver, with its readings.
+        processes: Process of each of r receivers, with its readings.
         everywhere: Coordinates of ``places.all``, as the processes take them.
         places: Candidates, and places over which the error is stated.
-        factor: Mean absolute error of a label over its standard deviation.
+        factor: Ratio of a label's mean absolute error to its standard deviation.
     """
 
     def __init__(
@@ -336,11 +351,13 @@ class Selection:
     ) -> tuple[list[int], Float[Tensor, " n1"]]:
         """Chooses up to ``count`` candidates, until the error is at most ``enough``.
 
+        The readings of chosen candidates stay in the covariances of this selection.
+
         Args:
             spacing: Keeps the candidates apart; None: they may be neighbours.
 
         Returns:
-            Numbers of the candidates; and the expected error before and after each.
+            Numbers of the candidates, and the expected error before and after each.
         """
         numbers = []
         errors = [self.error()]
@@ -359,35 +376,45 @@ class Selection:
 
     def error(self) -> float:
         """Expected mean error of a new reading, in the unit of labels."""
-        variances = torch.stack([part.diagonal()[self.evaluated] for part in self.posteriors])
-        variances = variances.clamp_min(0)  # (r, e)
-        deviations = (variances + variances.new_tensor(self.noises)[:, None]).sqrt()
+        rows = [covariances.diagonal()[self.evaluated] for covariances in self.posteriors]
+        variances = torch.stack(rows).clamp_min(0)  # (r, e)
+        noises = variances.new_tensor(self.noises)[:, None]
+        deviations = (variances + noises).sqrt()
         return self.factor * mean_of_received(deviations, self.chances[:, self.evaluated])
 
     def scatter(self) -> float:
-        """Mean error if the process were known: the noise of a reading alone."""
+        """Mean error by the noise of a reading alone, which no further measurement lowers."""
         noises = self.chances.new_tensor(self.noises)[:, None].sqrt()  # (r, 1)
         chances = self.chances[:, self.evaluated]  # (r, e)
         return self.factor * mean_of_received(noises.expand_as(chances), chances)
 
     def gains(self) -> Float[Tensor, " c"]:
-        """Fall of the summed variances by a reading at each candidate."""
+        """Fall of the summed variances by a reading at each candidate.
+
+        A reading at candidate x lowers the variance at place y by c(x, y)² / (c(x, x) + noise),
+        with the posterior covariance c. It counts by the probabilities that the receiver receives
+        from x and from y.
+        """
         count = len(self.is_free)
         total = torch.zeros_like(self.chances[0, :count])
-        for part, noise, chances in zip(self.posteriors, self.noises, self.chances, strict=True):
-            # A reading at x takes c(x, y)² / (c(x, x) + noise) off the variance at y.
-            squares = part[self.evaluated, :count].square()  # (e, c)
-            falls = chances[:count] * (chances[self.evaluated] @ squares)
-            total = total + falls / (part.diagonal()[:count] + noise)
+        receivers = zip(self.posteriors, self.noises, self.chances, strict=True)
+        for covariances, noise, chances in receivers:
+            squares = covariances[self.evaluated, :count].square()  # (e, c)
+            falls = chances[:count] * (chances[self.evaluated] @ squares)  # (c,)
+            total = total + falls / (covariances.diagonal()[:count] + noise)
         return total
 
     def measure(self, number: int) -> None:
-        """Adds a reading at a candidate."""
+        """Adds a reading at a candidate to the posterior covariances.
+
+        A receiver that receives from the candidate with probability p gets p of the fall.
+        """
         self.is_free[number] = False
-        for part, noise, chances in zip(self.posteriors, self.noises, self.chances, strict=True):
-            column = part[number]
+        receivers = zip(self.posteriors, self.noises, self.chances, strict=True)
+        for covariances, noise, chances in receivers:
+            column = covariances[number]
             fall = chances[number] * torch.outer(column, column)
-            part -= fall / (part[number, number] + noise)
+            covariances -= fall / (covariances[number, number] + noise)
 
 
 class Spacing:
@@ -417,7 +444,8 @@ class Spacing:
     def apart(self, is_free: Bool[Tensor, " c"]) -> Bool[Tensor, " c"]:
         """True for free candidates whose correlation with each chosen one is at most ``most``.
 
-        If there is none, ``most`` becomes its root, which half the distance reaches.
+        If there is none, ``most`` is lowered for this and all later calls: it becomes its square
+        root, which candidates at half the distance have. From 0.99 on all free candidates are True.
         """
         while self.most < 0.99:
             is_apart = is_free & (self.nearest <= self.most)
@@ -428,9 +456,10 @@ class Spacing:
 
     def add(self, number: int) -> None:
         """Adds a chosen candidate by its number."""
-        chosen = self.candidates[number : number + 1]
-        total = torch.zeros_like(self.candidates[:, 0])
+        chosen = self.candidates[number : number + 1]  # (1, d)
+        total = torch.zeros_like(self.candidates[:, 0])  # sum of correlations over receivers
         for process in self.processes:
             variance = process.covariances(chosen, chosen)[0, 0]
             total += process.covariances(chosen, self.candidates)[0] / variance
-        self.nearest = torch.maximum(self.nearest, (total / len(self.processes)).cpu().float())
+        correlations = (total / len(self.processes)).cpu().float()  # (c,)
+        self.nearest = torch.maximum(self.nearest, correlations)

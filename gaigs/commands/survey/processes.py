@@ -51,18 +51,22 @@ def default_process(
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
-    """The process with an unknown trend, which readings also have to determine.
+    """The process plus an unknown trend, which readings also have to determine.
 
-    The trend is a constant and, with a receiver's position [m], a slope over the decimal logarithm
-    of the distance. Both have twice the standard deviation of a reading, a typical difference
-    between receivers of one survey.
+    The trend is a + b (decades - middle), with normal a and b of twice the standard deviation of a
+    reading, a typical difference between receivers of one survey. The decades are decimal
+    logarithms of the distance to the receiver, their middle is the mean over readings. The trend
+    adds scale² (1 + (decades - middle) (decades' - middle)) to a covariance.
+
+    Args:
+        receiver: Position of the receiver [m]; None: the trend is the constant a.
     """
     first = process.places[:1]
-    variance = float(process.covariances(first, first)[0, 0] + process.noise)
-    scale = 2 * variance**0.5
+    variance = float(process.covariances(first, first)[0, 0] + process.noise)  # of a reading
+    scale = 2 * variance**0.5  # standard deviation of a and b
 
     def decades(places: Tensor) -> Tensor:
-        """Decimal logarithms of distances to the receiver, from 0.1 m on (n,)."""
+        """Decimal logarithms of distances to the receiver [m], at least 0.1 m (n,)."""
         return (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
 
     middle = decades(process.places).mean() if receiver is not None else 0.0
@@ -79,7 +83,8 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
 def posterior(process: Process, places: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
     """Covariances of the process at places, given its readings, at most ``LIMIT`` of them."""
     rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
-    whitened, _ = process.whitened(places, rows)
+    # With K = L L' of the readings and k between readings and places, ``whitened`` is L^-1 k.
+    whitened, _ = process.whitened(places, rows)  # (readings, g)
     return process.covariances(places, places) - whitened.mT @ whitened
 
 
@@ -88,7 +93,12 @@ def reception_chances(
 ) -> Float[Tensor, "r g"]:
     """Probability that each receiver receives a point, from the measured places around it.
 
-    Only measured places at the carrier of the points count, or else at the nearest carrier.
+    Only measured places at the carrier of the points count, or else at the nearest carrier. Without
+    measured places all probabilities are 1.
+
+    Args:
+        processes: Process of each receiver, with its readings.
+        points: Coordinates: x, y and z [m], and those of the carrier.
     """
     places = torch.cat([process.places for process in processes])  # (k, d)
     if not len(places):
@@ -101,11 +111,11 @@ def reception_chances(
     is_received = known.new_zeros(len(known), len(processes))
     is_received[rows, receivers[at_carrier]] = 1
     for receiver, process in enumerate(processes):
-        if process.is_part:  # places of its other readings are unknown
+        if process.is_part:  # its other readings may be at any place, so it counts everywhere
             is_received[:, receiver] = 1
     return reception_probability(points, known, is_received, is_received.mean(0)).mT
 
 
 def mean_of_received(values: Float[Tensor, "r g"], chances: Float[Tensor, "r g"]) -> float:
-    """Mean over links, weighted by their probability of reception."""
+    """Mean over receivers and places, weighted by the probability of reception (``chances``)."""
     return ((values * chances).sum() / chances.sum()).item()

@@ -42,7 +42,7 @@ class View:
 
     @cached_property
     def facts(self) -> list[dict]:
-        """Facts of each model that do not depend on the transmitter."""
+        """Axes, units, room and receivers of each model, for any place of the transmitter."""
         return [contents.facts() for contents in self.contents]
 
     def save(self, path: str | Path) -> None:
@@ -79,7 +79,7 @@ class View:
 
     def page(self, stored: dict | None = None) -> str:
         """The HTML page; without stored predictions the page asks its server for them."""
-        # Amplitudes and maps, paths, errors, and Gaussians.
+        # Colour maps of amplitudes and radio maps, of paths, of errors, and of Gaussians.
         colours = {}
         for name in ("viridis", "plasma_r", "YlOrRd", "Blues"):
             colours[name] = [colormaps[name](i, bytes=True)[:3] for i in range(256)]
@@ -88,14 +88,18 @@ class View:
         packed = gzip.compress(text.encode(), mtime=0)
         folder = files("gaigs.commands.view")
         page = folder.joinpath("page.html").read_text(encoding="utf-8")
-        parts = {"style": "page.css", "drawing": "drawing.js", "script": "page.js"}
-        for mark, name in parts.items():
-            page = page.replace(f"@{mark}@", folder.joinpath(name).read_text(encoding="utf-8"))
+        # The page has a mark such as @style@ where a file or the content belongs.
+        insertions = {"style": "page.css", "drawing": "drawing.js", "script": "page.js"}
+        for mark, name in insertions.items():
+            text = folder.joinpath(name).read_text(encoding="utf-8")
+            page = page.replace(f"@{mark}@", text)
         return page.replace("@content@", base64.b64encode(packed).decode())
 
     def stored(self, places: int = 96, fewest: int = 12, maps: int = 24, step: int = 3) -> dict:
-        """Predictions at evenly spread places in the box of the training transmitters, for all
-        receivers.
+        """Predictions for a page without a server, as JSON values.
+
+        Places are evenly spread in the box of the training transmitters. Each has predictions for
+        all receivers.
 
         Args:
             places: Approximate number of stored predictions of a model, over all receivers.
@@ -106,17 +110,20 @@ class View:
         scene = self.contents[0].scene
         count = len(scene.receivers)
         grid = even_places(scene.lower, scene.upper, max(fewest, places // count))
-        heights = grid[:, 2].unique()
-        heights = heights[evenly(torch.arange(len(heights)), max(1, maps // count))].tolist()
+        all_heights = grid[:, 2].unique()
+        shown_heights = evenly(torch.arange(len(all_heights)), max(1, maps // count))
+        heights = all_heights[shown_heights].tolist()  # of the radio maps
         runs = []
         for contents in self.contents:
             answers = []
             for place in grid.tolist():
-                answers.append([contents.answer(place, k, step) for k in range(count)])
+                answers.append(
+                    [contents.answer(place, receiver, step) for receiver in range(count)]
+                )
             slices = []
             for height in heights if contents.has_map else ():
-                slices.append([contents.slice(height, k) for k in range(count)])
-            links = [contents.comparison(k, step) for k in range(len(contents.tests))]
+                slices.append([contents.slice(height, receiver) for receiver in range(count)])
+            links = [contents.comparison(number, step) for number in range(len(contents.tests))]
             runs.append({"answers": answers, "maps": slices, "links": links})
         return {"places": grid.tolist(), "heights": heights, "runs": runs}
 
@@ -157,7 +164,7 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
 
 
 def side_by_side(contents: list[Contents]) -> list[Contents]:
-    """The contents; raises a ``ValueError`` if their receivers differ."""
+    """The given contents; raises a ``ValueError`` if their receivers differ."""
     scene = contents[0].scene
     places = scene.positions(scene.lower)
     names = [receiver.name for receiver in scene.receivers]
@@ -173,7 +180,10 @@ def side_by_side(contents: list[Contents]) -> list[Contents]:
 
 
 def contents_of(source: str | Path, trust: bool = False) -> Contents:
-    """The contents of a run's folder, or of a checkpoint without its data."""
+    """The contents of a run's folder, or of a checkpoint.
+
+    A checkpoint comes without its links, and so does a run of arrays in memory.
+    """
     path = Path(source)
     if path.is_file():
         return Contents(load(path, trust), title=path.stem)

@@ -28,7 +28,7 @@ from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 
 class Shown(NamedTuple):
-    """Predictions on the CPU."""
+    """Predictions of a model and their uncertainty, on the CPU."""
 
     value: Tensor
     std: Tensor | None  # their deviations; None if the model states none
@@ -91,7 +91,10 @@ class Contents:
             return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
-        """Axes, units, room, Gaussians, receivers and errors of links, for any transmitter."""
+        """Axes, units, room, Gaussians, receivers and errors of links.
+
+        They do not depend on the place of the dragged transmitter.
+        """
         quantity = with_unit(self.task.quantity, self.task.unit)
         with self.lock:
             gaussians = self.model.primitives
@@ -177,7 +180,7 @@ class Contents:
             paths = self.model.learnt_paths(query)
         answer["paths"] = [
             {"points": plain(path.points), "power": plain(path.power_db)} for path in paths
-        ]
+        ]  # power [dB] relative to the strongest path
         return answer | {"place": plain(place)}
 
     def moved(self, receiver: int, position: list[float]) -> "Contents":
@@ -188,41 +191,43 @@ class Contents:
         """
         key = receiver, *position
         if self.last is None or self.last[0] != key:
-            known = self.scene.receivers[receiver]
-            place = as_positions("receiver", position).to(known.pose.position)
-            moved = replace(known, pose=replace(known.pose, position=place))
+            unmoved = self.scene.receivers[receiver]
+            new_position = as_positions("receiver", position).to(unmoved.pose.position)
+            moved = replace(unmoved, pose=replace(unmoved.pose, position=new_position))
             with self.lock:
                 model = self.model.at_receivers([moved])
-            self.last = key, Contents(model, points=self.points)
+            self.last = key, Contents(model, points=self.points)  # for the next requests of a drag
         return self.last[1]
 
     def answer_at(self, place: list[float], receiver: int, position: list[float]) -> dict:
         """``answer`` with one receiver moved to another position [m]."""
         answer = self.moved(receiver, position).answer(place, 0)
         if self.kind == "level":
+            # The page shows levels of all receivers: the others' come from the unmoved model.
             unmoved = self.answer(place, receiver)
             for name in ("levels", "stds"):
-                values = unmoved[name]
-                new = answer[name]
-                if values is None or new is None:
+                all_values = unmoved[name]
+                moved_value = answer[name]  # of the moved receiver alone, a list of one
+                if all_values is None or moved_value is None:
                     answer[name] = None
                 else:
-                    answer[name] = [*values[:receiver], *new, *values[receiver + 1 :]]
+                    before, after = all_values[:receiver], all_values[receiver + 1 :]
+                    answer[name] = [*before, *moved_value, *after]
         return answer
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
-        pitch = float((upper - lower).max()) / self.points
+        pitch = float((upper - lower).max()) / self.points  # edge of a cell [m]
         columns, rows = np.maximum(np.ceil((upper - lower) / pitch).astype(int), 1)
         x = lower[0] + pitch * (np.arange(columns) + 0.5)
         y = lower[1] + pitch * (np.arange(rows) + 0.5)
         heights = np.full((rows, columns), height)
         places = np.stack((*np.meshgrid(x, y), heights), -1).astype(np.float32)
         points = torch.from_numpy(places.reshape(-1, 3))  # (rows columns, 3)
-        # In parts, so that a drag need not wait for the whole map.
-        parts = [self._estimate(part, receiver).value for part in points.split(self.points)]
-        values = torch.cat(parts)
+        # In blocks, so that other requests, as of a drag, get the lock between them.
+        blocks = [self._estimate(block, receiver).value for block in points.split(self.points)]
+        values = torch.cat(blocks)
         if values.is_complex():
             values = level(values)
         return {"x": plain(x), "y": plain(y), "height": plain(height), "values": plain(values)}
@@ -231,6 +236,7 @@ class Contents:
         """Label and prediction of a displayed test link; ``step`` is as for ``answer``."""
         labels, values = self.compared
         value = values[number]
+        # If the task ignores the phase of channels, the label takes the phase of the prediction.
         label = self.task.align(labels[number : number + 1], values[number : number + 1])[0]
         if self.kind == "level":
             return {"label": plain(label), "prediction": plain(value)}
@@ -243,7 +249,7 @@ class Contents:
         return {}
 
     def _estimate(self, points: Float[Tensor, "b 3"], receiver: int | None) -> Shown:
-        """Predictions at places [m] for a receiver; None for all."""
+        """Predictions for transmitters at places [m] at one receiver, or at all if it is None."""
         options = {
             "frequency": self.frequency,
             "batch_size": self.points,
@@ -256,8 +262,9 @@ class Contents:
                 predicted: Any = self.model.predict(points, receiver, **options)
         if self.interval is None:
             return Shown(predicted.cpu(), None, None)
-        parts = (predicted.value, predicted.std, predicted.snr_db)
-        return Shown(*(None if part is None else part.cpu() for part in parts))
+        snr_db = predicted.snr_db
+        snr_db = None if snr_db is None else snr_db.cpu()
+        return Shown(predicted.value.cpu(), predicted.std.cpu(), snr_db)
 
     def _curve(self, channel: Tensor, element: int) -> dict:
         """Curve of a channel: |h| [dB] over delay [ns] at an element.
@@ -310,35 +317,40 @@ def plane_facts(plane: LearntPlane) -> dict:
 def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
     """The ``most`` strongest Gaussians in the page's form, and the number of all."""
     with torch.no_grad():
-        strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
+        # The first coefficient is the mean signal over all directions, up to the factor ``SH_DC``.
+        amplitudes = SH_DC * gaussians.signal[..., 0].norm(dim=-1)  # (n,)
+        strengths = gaussians.opacities * amplitudes
         strongest = strengths.topk(min(most, len(strengths))).indices
-        parts = gaussians.means, gaussians.covariances, gaussians.opacities, strengths
-        arrays = [part[strongest].cpu().numpy() for part in parts]
+        columns = gaussians.means, gaussians.covariances, gaussians.opacities, strengths
+        arrays = [column[strongest].cpu().numpy() for column in columns]
     return splats(*arrays) | {"total": len(strengths)}
 
 
 def obstacle_splats(matter: Matter) -> dict:
-    """Obstacles in the page's form; opacity is the power that a central path loses."""
-    widths = matter.widths
-    losses = matter.densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
-    covariances = widths[:, :, None] ** 2 * np.eye(3)
-    # A box as the Gaussian with its mean and covariance. Over an edge of half length s the variance
-    # is s² / 3, and each s is met at 8 corners.
+    """Obstacles in the page's form; opacity is the fraction of power that a central path loses."""
+    # The integral of a Gaussian density over a line through its centre, in the mean direction.
+    mean_widths = np.exp(np.log(matter.widths).mean(1))  # geometric [m]
+    gaussian_losses = matter.densities * math.sqrt(2 * math.pi) * mean_widths  # [dB]
+    gaussian_covariances = matter.widths[:, :, None] ** 2 * np.eye(3)
+    # A box becomes the Gaussian with its mean and covariance. An axis of half length s has the
+    # variance s² / 3. The sum of squared offsets of 8 corners is 8 s², thus the division by 24.
     middles = matter.boxes.mean(1)
-    sides = matter.boxes - middles[:, None]  # (m, 8, 3), half an edge along each axis
-    covariances = np.concatenate((covariances, np.einsum("mci,mcj->mij", sides, sides) / 24))
-    losses = np.concatenate((losses, matter.losses))
+    offsets = matter.boxes - middles[:, None]  # (m, 8 corners, 3)
+    box_covariances = np.einsum("mci,mcj->mij", offsets, offsets) / 24
+    covariances = np.concatenate((gaussian_covariances, box_covariances))
+    losses = np.concatenate((gaussian_losses, matter.losses))  # [dB]
     centres = np.concatenate((matter.centres, middles))
     return splats(centres, covariances, 1 - 10 ** (-losses / 10), losses)
 
 
 def plain(values: Any) -> Any:
-    """Numbers for JSON: four significant digits, at least three decimals below 10,000."""
+    """Numbers for JSON, rounded: the largest to four significant digits, or to three decimals."""
     if isinstance(values, Tensor):
         values = values.detach().cpu()
     array = np.asarray(values, dtype=np.float64)
     largest = float(np.abs(array).max(initial=1e-30))
-    return np.round(array, max(3, 3 - math.floor(math.log10(largest)))).tolist()
+    decimals = max(3, 3 - math.floor(math.log10(largest)))
+    return np.round(array, decimals).tolist()
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
@@ -362,15 +374,18 @@ def splats(
     opacities: Float[ndarray, " n"],
     strengths: Float[ndarray, " n"],
 ) -> dict:
-    """Gaussians in the page's form; covariances [m²] by their upper triangles."""
+    """Gaussians as JSON lists of the page; of covariances [m²] only the upper triangles."""
     rows, columns = np.triu_indices(3)
-    parts = {"means": means, "covariances": covariances[:, rows, columns], "opacities": opacities}
-    parts["strengths"] = strengths
-    return {name: plain(part) for name, part in parts.items()}
+    return {
+        "means": plain(means),
+        "covariances": plain(covariances[:, rows, columns]),
+        "opacities": plain(opacities),
+        "strengths": plain(strengths),
+    }
 
 
 def loudest(channel: Tensor) -> Tensor:
-    """The element with the most power."""
+    """Number of the element of a channel (elements, subcarriers) with the most power."""
     return channel.abs().square().sum(1).argmax()
 
 

@@ -21,9 +21,12 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
     """
 
     class Handler(BaseHTTPRequestHandler):
+        """Answers the requests of one connection."""
+
         protocol_version = "HTTP/1.1"  # one connection for all answers
 
         def do_GET(self) -> None:
+            """Sends the page, an answer, or the message of an error."""
             url = urlsplit(self.path)
             kind = "application/json"
             status = HTTPStatus.OK
@@ -59,9 +62,10 @@ def respond(contents: list[Contents], path: str, query: dict[str, Any]) -> str:
 
     Args:
         contents: Displayed contents of each model.
-        query: Values of the URL: numbers of ``run`` and ``receiver``; ``at``, the new place of a
-            dragged receiver [m]; and the arguments of the path, ``place``, ``height`` or
-            ``number``.
+        path: Kind of the answer.
+        query: Values of the URL: ``run``, the number of the contents; ``receiver``, its number;
+            ``at``, the new position of a dragged receiver [m]; and ``place`` of a transmitter [m],
+            ``height`` of a slice [m], or ``number`` of a test link.
     """
     run = contents[int(query["run"])]
     receiver = int(query.get("receiver", 0))
