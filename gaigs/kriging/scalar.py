@@ -383,15 +383,19 @@ class ScalarProcess(nn.Module):
 
     def take(self, other: "ScalarProcess") -> None:
         """Copies another process's hyperparameters; means need another ``solve``."""
+        # A NaN, the scale of a single carrier, would differ from itself.
         choices = [choice.nan_to_num() for choice in (self.choice, other.choice)]
         if torch.equal(self.logarithms, other.logarithms) and torch.equal(*choices):
             return  # mixtures in the cache stay valid
-        ratios = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
+        # Kernel and noise are alike; local mixtures have no use for the variances of readings.
         is_alike = torch.equal(self.choice[:2], other.choice[:2]) or other._choice.is_local
-        self.variances = self.variances * ratios
+        before = self.logarithms
         self.logarithms, self.choice = other.logarithms, other.choice
         self.kept.clear()
-        if not is_alike:  # readings that disagree count less with one noise than with another
+        if is_alike:  # variances change as those of their receivers' noise, in column 2
+            ratios = (2 * (self.logarithms - before)[self.receivers, 2]).exp()
+            self.variances = self.variances * ratios
+        else:  # readings that disagree count less with one noise than with another
             noises = (2 * self.logarithms[self.receivers, 2]).exp()
             self.variances = noises * self._factors(self.values)
 

@@ -192,9 +192,11 @@ class HeldOutCost:
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
+        # By the logarithms of length, signal and noise of the readings around, and of the scale.
         of_place = slopes(  # (m, 4)
             self.around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
         )
+        # The held-out reading's own noise: d variance / d log deviation = 2 variance.
         of_place[:, 2] += 2 * of_noise * noises
         gradient = torch.zeros_like(logarithms).index_add(0, receivers, of_place[:, :3])
         return total.item(), gradient, of_place[:, 3].sum().item()

@@ -113,7 +113,7 @@ class GaussianProcess(LookUp):
         report_terms(self.trend)
 
     def refit(self, links: Links) -> None:
-        """Fits to some of the known links, with kernel, noise and trend from ``fit``.
+        """Fits to fewer known links, with kernel, noise and trend from ``fit``.
 
         Labels with many values also keep all hyperparameters. For scalar labels lengths and
         deviations are fitted again, unless more than ``ScalarOptions.large`` links are known.

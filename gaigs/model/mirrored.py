@@ -376,13 +376,13 @@ class MirroredSplatting(GaussianSplatting):
     def _box_search(self, batch: Batch) -> BoxSearch:
         """The search for boxes in some links, along the axes of the room."""
         query = batch.query.to(self.device)
-        errors = self._shadow_errors(query, batch.labels.to(self.device))
+        errors_of = self._shadow_errors(query, batch.labels.to(self.device))
         axes = self.placement.room_axes  # (3, 3), a column for each axis of the room
-        links = self.placement.folded(query)
-        paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
-        transmitters = links.seen[0][:, 0]  # the direct path starts at the transmitter (b, 3)
-        ends = torch.cat((transmitters, links.receivers)).unique(dim=0) @ axes
-        return BoxSearch(paths, errors, ends)
+        folded = self.placement.folded(query)
+        paths = folded.paths._replace(start=folded.paths.start @ axes, end=folded.paths.end @ axes)
+        transmitters = folded.seen[0][:, 0]  # starts of the direct paths (b, 3)
+        ends = torch.cat((transmitters, folded.receivers)).unique(dim=0) @ axes
+        return BoxSearch(paths, errors_of, ends)
 
     def _shadow_errors(self, query: Query, labels: Tensor) -> ChannelErrors | LevelErrors:
         """The function from losses of paths in obstacles to errors of links, for ``BoxSearch``."""

@@ -27,7 +27,7 @@ class ShapedPathLoss(PathLoss):
         self._fit_terms(links, chooses=True)
 
     def refit(self, links: Links) -> None:
-        """Fits level, exponent and the chosen terms to some of the known links."""
+        """Fits level, exponent and the terms that ``fit`` chose to fewer known links."""
         self._fit_terms(links, chooses=False)
 
     def _fit_terms(self, links: Links, chooses: bool) -> None:

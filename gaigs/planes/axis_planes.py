@@ -93,6 +93,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         """
         walls: list[Candidate] = []
         between: list[Candidate] = []
+        # 400 planes for each normal, evenly over the box and its margin (k, 400, 4).
         lines = self.frame.grid(normals, 400, self.data.options.margin)
         for line, shares in zip(lines, self.score.rate(room, lines).ratings, strict=True):
             for plane in room.planes:

@@ -229,7 +229,10 @@ def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 
 def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
-    """The folder ``src`` of each project in a folder, or the project's folder without ``src``."""
+    """Source folders of the projects in a folder: ``src`` where it exists, else the project's own.
+
+    A project has a ``pyproject.toml``. ``project`` is the pattern of the projects' folder names.
+    """
     places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
     return [place / "src" if (place / "src").is_dir() else place for place in places]
 

@@ -29,7 +29,7 @@ LARGEST = 2**63 - 1
 
 
 def check_instance(name: str, value: object, kind: type) -> None:
-    """Raises a ``TypeError`` unless a value is an object of a class of gaigs."""
+    """Raises a ``TypeError`` unless a value is an object of ``kind``, a class of gaigs."""
     if not isinstance(value, kind):
         raise TypeError(f"{name} must be a gaigs.{kind.__name__}, got {reprlib.repr(value)}")
 

@@ -71,7 +71,8 @@ def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
     row |= {key: run.overrides.get(key, "") for key in varied}
     if run.metrics is None:
         return row
-    model, scores = next(iter(run.metrics["models"].items()))
+    model, scores = next(iter(run.metrics["models"].items()))  # the run's model is first
+    # An override of ``model`` may already have named it.
     row |= {"status": "done", "model": row["model"] or model}
     row |= {fact: run.metrics[fact] for fact in facts}
     row |= scores

@@ -99,9 +99,10 @@ def _draw_spectrum(
 def _draw_channel(
     ax: Axes, parts: Mapping[str, ndarray], axes: Mapping[str, Axis], title: str, names: ndarray
 ) -> None:
-    """Draws a channel's magnitude over frequency at its strongest element.
+    """Draws a channel's magnitude over frequency at its strongest element, in dB.
 
     The interval of a complex value is a disc. The drawn band spans the magnitudes within it.
+    ``parts`` has the values and the discs' radii (e, s), NaN at elements without a prediction.
     """
     element = int(np.nansum(abs(parts["value"]) ** 2, 1).argmax())
     value = abs(parts["value"][element])

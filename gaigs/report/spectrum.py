@@ -34,7 +34,9 @@ class SpectrumFigures(TaskFigures):
         return {
             "spectra": spectra(shown, elevations, azimuths),
             "spectra_polar": spectra(shown, elevations, azimuths, polar=True),
-            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1), True),
+            "ssim_cdf": cdf(
+                scores, "SSIM", "spectra", links.split.name, (None, 1), higher_is_better=True
+            ),
         }
 
     def of_systems(
@@ -53,7 +55,7 @@ class SpectrumFigures(TaskFigures):
                 azimuths = np.rad2deg(run["azimuths"])
         shown = {"label": label} | predictions
         return {
-            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1), True),
+            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1), higher_is_better=True),
             "spectra": side_by_side(shown, elevations, azimuths),
         }
 

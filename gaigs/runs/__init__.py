@@ -245,7 +245,7 @@ def _log_links(links: Links, name: str) -> None:
 
 
 def _facts(links: Links, seed: int, model: Model, fitted: Any, best: Path) -> dict:
-    """Entries of ``metrics.json`` beside the scores; ``fitted`` is a result of ``fit``."""
+    """Entries of ``metrics.json`` beside the scores; ``fitted`` comes from ``fitting.fit``."""
     from gaigs.runs import evaluation
     from gaigs.runs.fitting import count_gaussians
 

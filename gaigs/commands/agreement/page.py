@@ -123,7 +123,11 @@ def _distance(bounds: tuple[float, float]) -> str:
 
 
 def _separation(bounds: tuple[int, float]) -> str:
-    """The label of a column; the largest separation is infinite in the last column."""
+    """The label of a column of separations; bounds [measurements], both included.
+
+    The last column has no upper bound: "at least low" reads "over low - 1", which ends the column
+    before.
+    """
     low, high = bounds
     if math.isinf(high):
         return f"over {low - 1:,}" if low else "any"

@@ -42,7 +42,7 @@ class View:
 
     @cached_property
     def facts(self) -> list[dict]:
-        """Axes, units, room and receivers of each model, for any place of the transmitter."""
+        """Axes, units, room and receivers of each model, which hold for all transmitters."""
         return [contents.facts() for contents in self.contents]
 
     def save(self, path: str | Path) -> None:

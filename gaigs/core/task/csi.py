@@ -113,7 +113,8 @@ class Csi(Task):
         """Labels aligned to predictions: unknown phases, delays and gains are removed.
 
         ``per_link`` aligns the phase of each link, ``per_link_and_delay`` also its delay and power.
-        The gradient includes this power, so losses do not depend on the scale of the predictions.
+        Labels then have the power of the predictions, and gradients pass through it. So a loss
+        relative to the label's power does not depend on the scale of the predictions.
         """
         if self.phase == "known":
             return labels
@@ -122,10 +123,10 @@ class Csi(Task):
             return turned
         label_sizes = turned.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
         value_sizes = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
-        # Links without a label or prediction keep their scale, with a gain of 1.
-        is_received = (label_sizes > 0) & (value_sizes > 0)
-        wanted = torch.where(is_received, value_sizes, 1)
-        gains = wanted / torch.where(is_received, label_sizes, 1)  # (k,)
+        # Links whose label or prediction is 0 keep their scale, with a gain of 1.
+        are_nonzero = (label_sizes > 0) & (value_sizes > 0)
+        wanted = torch.where(are_nonzero, value_sizes, 1)
+        gains = wanted / torch.where(are_nonzero, label_sizes, 1)  # (k,)
         return turned * gains[:, None, None].to(turned.real)
 
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:

@@ -191,10 +191,10 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 
 
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
-    """The gain of a law with the errors ``fits`` over the law of the data as read.
+    """How much smaller errors under another convention are than those of the data as read.
 
-    None if the gain may be due to chance, or to directional antennas: a law of the data as read
-    with antenna patterns then fits as well.
+    None if chance may explain it, or if directional antennas do: the data as read then follow a
+    law with antenna patterns as well.
 
     Args:
         fits: Errors of the law under another convention [dB].

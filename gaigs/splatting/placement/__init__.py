@@ -33,7 +33,7 @@ class Placement(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, gaussians: Gaussians, query: Query) -> Placed:
-        """The Gaussians of each query.
+        """The Gaussians of each link of a query.
 
         Args:
             gaussians: The trainable Gaussians; may be None for a placement with ``has_own``.

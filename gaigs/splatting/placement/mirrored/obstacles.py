@@ -70,7 +70,13 @@ class Obstacles(nn.Module):
     def place_boxes(
         self, axes: Float[Tensor, "3 3"], boxes: Float[Tensor, "k 2 3"], depths: Float[Tensor, " k"]
     ) -> None:
-        """Sets boxes with their depths [Np], and resets Gaussians to their faint initial values."""
+        """Sets boxes with their depths [Np], and resets the Gaussians to their faint densities.
+
+        Args:
+            axes: Axes of the boxes, in columns.
+            boxes: Least and largest coordinates along these axes [m].
+            depths: Attenuation by each box [Np].
+        """
         self.box_axes.copy_(axes)
         self.boxes.zero_()
         self.boxes[: len(boxes)] = boxes
@@ -277,18 +283,17 @@ class _Legs(NamedTuple):
 def _measure_legs(start: Tensor, end: Tensor, centres: Tensor, log_widths: Tensor) -> _Legs:
     """The terms of ``_Depth`` for segments (s, 3) and obstacles (k, 3)."""
     ray = end - start
-    # One row for each axis. Contiguous rows: an outer product of others takes a CPU four times as
-    # long.
+    # A contiguous row for each axis: a CPU multiplies strided ones in four times the time.
     inverse = (-log_widths).exp().T.contiguous()
     places = centres.T.contiguous()
     starts = start.T.contiguous()
     ways = ray.T.contiguous()
-    # C - B²/A is the squared distance of a line from a centre. Differences of places come first:
-    # products of the places themselves would be large numbers with a small difference.
-    # Offsets and rays in units of the widths (s, k), by axis.
+    # C - B²/A, the squared distance of a line from a centre, would be a small difference of large
+    # numbers if the centre were not subtracted first.
+    # Both lists are in units of the widths (s, k), by axis.
     offsets = [(starts[axis, :, None] - places[axis]).mul_(inverse[axis]) for axis in range(3)]
     rays = [ways[axis, :, None] * inverse[axis] for axis in range(3)]
-    # The least squared length [squared widths]: within 1e-4 of a width nothing changes.
+    # A divides, so a segment shorter than 1e-4 widths, even of length 0, counts as that long.
     a = (ray.square() @ inverse.square()).clamp_min_(1e-8)
     b = (rays[0] * offsets[0]).addcmul_(rays[1], offsets[1]).addcmul_(rays[2], offsets[2])
     c = offsets[0].square_().addcmul_(offsets[1], offsets[1]).addcmul_(offsets[2], offsets[2])

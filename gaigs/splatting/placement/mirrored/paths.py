@@ -81,6 +81,7 @@ class Mirrored(PathFields):
         super().__init__(scene, planes, order, obstacles, walls, fixed)
         self.channels = channels
         self.register_buffer("coherent", torch.tensor(False))
+        # Checkpoints of amplitudes lack the states of these stages, which only channels have.
         self.register_buffer("is_bare", torch.tensor(False), persistent=self.is_complex)
         self.register_buffer("found", torch.tensor(False), persistent=self.is_complex)
         self.register_buffer("planned", self.kept.clone(), persistent=self.is_complex)
