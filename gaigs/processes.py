@@ -100,9 +100,22 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     finally:
         torch.set_num_threads(before)
         for name, value in environment.items():
-            os.environ.pop(name)
+            os.environ.pop(name, None)
             if value is not None:
                 os.environ[name] = value
+
+
+@contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Limits torch's threads alone; other threads of Python may do so at the same time."""
+    import torch  # slow to import
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:

@@ -158,7 +158,7 @@ class GeometricAttention(nn.Module):
         inner_blades = metric.nonzero().flatten()  # blades that the inner product sees
         ideal_blades = ideal.nonzero().flatten()
         # The logit of ``features`` a and b is a' form b. The features of a distance are (x·x, h²,
-        # h x), and minus the squared distance is -g² y·y - h² x·x + 2 g h x·y.
+        # h x), and minus the squared distance, times g² h², is -g² x·x - h² y·y + 2 g h x·y.
         form = torch.diag(metric[inner_blades])
         if len(ideal_blades):
             distance = torch.tensor([[0.0, -1.0], [-1.0, 0.0]])

@@ -144,10 +144,11 @@ def fit_hyperparameters(
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def cost(logarithms: Tensor) -> Tensor:
+        hyperparameters = logarithms.exp()
         total = torch.zeros(())
         for held in held_out:
             total = total + negative_log_likelihood(
-                scene, held, *logarithms.exp(), by_errors=length is not None
+                scene, held, *hyperparameters, by_errors=length is not None
             )
         return total
 

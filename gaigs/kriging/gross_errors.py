@@ -10,10 +10,10 @@ from torch import Tensor
 
 from gaigs.data import Links
 from gaigs.kriging.links import coordinates, distances
-from gaigs.processes import limited_threads
+from gaigs.processes import torch_threads
 
 
-@limited_threads(1)  # more take longer for short vectors
+@torch_threads(1)  # more take longer for short vectors
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
     """A copy of the links in which known levels with gross errors are removed from the split.
 

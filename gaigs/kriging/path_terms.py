@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.links import folds_of
-from gaigs.processes import limited_threads
+from gaigs.processes import torch_threads
 
 log = logging.getLogger(__name__)
 
@@ -95,7 +95,7 @@ class PathTerms(nn.Module):
         columns = self._columns(transmitters, receivers, self.breaks[radios, None])  # (b, n)
         return (columns * self.coefficients[radios]).sum(1).to(transmitters)
 
-    @limited_threads(1)  # more take longer for small matrices
+    @torch_threads(1)  # more take longer for small matrices
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
         """Fits the coefficients to ``errors``, the residuals of a path-loss law at known links.
 

@@ -22,7 +22,7 @@ from gaigs.kriging.likelihood import (
 )
 from gaigs.kriging.links import scale_bounds
 from gaigs.kriging.neighbours import HeldOutReadings
-from gaigs.processes import limited_threads
+from gaigs.processes import torch_threads
 
 
 @dataclass(frozen=True)
@@ -235,7 +235,7 @@ class HeldOutCost:
         return ScalarFit(cost, logarithms, choice._replace(scale=float(choice.scale)))
 
 
-@limited_threads(1)  # more take longer for many small matrices
+@torch_threads(1)  # more take longer for many small matrices
 def maximise(cost: HeldOutCost, start: Float[Tensor, "r 3"] | None = None) -> ScalarFit:
     """The hyperparameters with the lowest cost, from ``start`` or a coarse grid.
 

@@ -205,13 +205,13 @@ class MirroredSplatting(GaussianSplatting):
         query = links.query[train]
         waves = direct_waves(self.scene, query, task.frequencies, sign)  # (b, e, s)
         waves = direct_gains(self.scene, query)[:, None, None] * waves
+        walls = placement.used if placement.walls else placement.used[:0]  # of the user
+        start = placement.planes[walls].cpu()  # read before free space has no planes
         gains = self._receiver_gains(links.labels[train], query, waves, pooling)
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
         placement.enable_phases(speed_of_light / self.scene.middles.max().item())
         if placement.fixed or not placement.order:  # no planes to search
             return
-        walls = placement.used if placement.walls else placement.used[:0]  # given by the user
-        start = placement.planes[walls].cpu()
         has_phase = task.phase == "known" and sign != 0
         if placement.has_few_numbers:
             if has_phase:

@@ -310,7 +310,7 @@ class BoxSearch:
     def _cut(self, box: Cuboid) -> None:
         """Replaces a box by nothing, itself or two parts of it, in favour of the lowest error.
 
-        The box must lower the error by ``price`` to stay, and two parts by ``price`` once more.
+        Each trial, the box first, must be better than the best so far by ``price``.
         """
         others = [other for other in self.boxes if other is not box]
         depths = self._depths(others)

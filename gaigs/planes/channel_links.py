@@ -367,9 +367,8 @@ class ChannelData:
             count = len(receiver.places)
             step = max(1, min(count // 16, count * len(receivers) // 100))
             thinned = receiver.at(slice(None, None, step))
-            direct = self.fit_free(thinned, planes, 1e-4).strengths[
-                :, 0
-            ]  # path 0 is the direct one
+            # Path 0 is the direct one.
+            direct = self.fit_free(thinned, planes, 1e-4).strengths[:, 0]
             # Phases of blocked direct paths are wrong: the stronger half decides.
             is_strong = direct.abs() >= direct.abs().median()
             phases.append((direct.sgn() * is_strong).sum()[None].sgn())

@@ -169,8 +169,8 @@ def compare_with_wave(
     # radian that it turns, it changes by this times the bounce's distance from the pivot.
     normals, offsets = planes[:, None, :3], planes[:, None, 3]
     heights = (receiver.places * normals).sum(-1) - offsets  # (c, b)
-    from_images = reflect(receiver.places, normals, offsets) - receiver.pose.position
-    units = functional.normalize(from_images, dim=2)  # (c, b, 3)
+    to_images = reflect(receiver.places, normals, offsets) - receiver.pose.position
+    units = functional.normalize(to_images, dim=2)  # (c, b, 3)
     # From place to bounce the path is height / cos(theta) long. So the bounce's distance from the
     # pivot times cos(theta) is the place's (``aside``) times cos(theta), plus the height times the
     # path's direction.

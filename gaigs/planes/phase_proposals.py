@@ -133,12 +133,12 @@ def _phasors(
 
     def path_lengths(shift: Float[Tensor, "3"]) -> Float[Tensor, " b"]:
         plane = _shifted(planes[number], axes, shift)
-        from_images = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
-        return from_images.norm(dim=1)
+        to_images = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
+        return to_images.norm(dim=1)
 
     slopes = torch.autograd.functional.jacobian(path_lengths, torch.zeros(3).double())  # (b, 3)
-    from_images = reflect(receiver.places, normal, offset) - receiver.position  # (b, 3)
-    cosines = (functional.normalize(from_images, dim=1) @ normal).abs().clamp(1e-3, 1)
+    to_images = reflect(receiver.places, normal, offset) - receiver.position  # (b, 3)
+    cosines = (functional.normalize(to_images, dim=1) @ normal).abs().clamp(1e-3, 1)
     weights = strengths.abs() * waves[:, path].norm(dim=1) / receiver.flat.norm(dim=1)  # (b,)
     values = weights * strengths.sgn() * phase.conj()
     places_per_receiver = max(16, 120 // len(data.receivers))

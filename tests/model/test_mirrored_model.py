@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -131,6 +132,21 @@ def test_with_the_rooms_walls_it_predicts_channels(array):
         assert found.dtype == torch.complex64
         noise = (found - expected).abs().square().sum((1, 2)) / expected.abs().square().sum((1, 2))
         assert -10 * noise.log10().mean() > 45
+
+
+def test_the_search_of_channels_starts_from_the_users_walls(monkeypatch):
+    receiver = Receiver("gateway1", POSE, BENT)
+    labels = simulated(place(12, 0), receiver, FREQUENCIES - CARRIER, 1).to(torch.complex64)
+    links = links_of(labels, Csi(4, FREQUENCIES), receiver)
+    model = walled(build(links, pooling="path_csi"))
+    model.placement.walls = "walls.obj"
+    walls = model.placement.planes[model.placement.used].clone()
+    search = Mock(side_effect=StopIteration)
+    monkeypatch.setattr("gaigs.model.mirrored.ChannelSearch", search)
+    with pytest.raises(StopIteration):
+        model._fit_channels(links, links.task, model.pooling)
+    assert len(walls) == 6
+    torch.testing.assert_close(search.call_args.args[-1], walls)
 
 
 @pytest.mark.parametrize("conjugated", [False, True])

@@ -60,7 +60,7 @@ def make(name, scene, task="spectrum", **options):
         (name, task)
         for name in SMALL
         for task in TASKS.get(name, DATA)
-        # Three have the parts of wide_gs but for the deformation, which reads no task.
+        # Two have the parts of wide_gs but for the deformation, which reads no task.
         if task == "spectrum" or name not in ("wrf_gs", "wrf_gs_plus")
     ],
 )

@@ -165,7 +165,10 @@ class _Steering:
         self.least = (least_spread * wavenumbers).square()  # (b, 1, 1) [rad²/m²]
 
     def at(self, steps: Float[Tensor, "k 3"]) -> Complex[Tensor, "*b n k"]:
-        """Response exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) to each path at k points D [m]."""
+        """Response to each path at k points x [m], with D = x / lambda as in ``sum_paths``.
+
+        It is exp(-(2 pi)² D' S D / 2 + j 2 pi D . u).
+        """
         if self.is_point:
             return self.amplitudes.new_ones(1, 1, len(steps))
         spreads = _spreads(self.across, steps)  # (b, n, k)
@@ -199,9 +202,9 @@ def _see(paths: ReceivedPaths) -> _Seen:
 def _spreads(
     across: Float[Tensor, "b n 3 3"], steps: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "b n k"]:
-    """(2 pi)² D' S D of each path at each step D [m], with S the covariance of direction cosines.
+    """(2 pi / lambda)² x' S x of each path at each step x [m]; S as in ``sum_paths``.
 
-    ``across`` is as in ``_Seen``: its product with its transpose is (2 pi)² S.
+    ``across`` is as in ``_Seen``: its product with its transpose is (2 pi / lambda)² S.
     """
     # One matrix product for all paths.
     rows = across.movedim(-2, 0).flatten(1)  # (3, b n 3)

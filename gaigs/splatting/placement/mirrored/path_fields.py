@@ -321,7 +321,7 @@ class PathFields(MovablePlanes):
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
         """Adapts parameters to the receivers of ``scene``, each of which gets the same mean gain.
 
-        The mean is over the former receivers for which ``known`` is True. None: receivers with
+        The mean is over the former receivers with the numbers ``known``. None: receivers with
         training links.
         """
         is_known = self.is_heard if known is None or scene.one_radio else known
