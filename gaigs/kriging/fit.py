@@ -144,12 +144,11 @@ def fit_hyperparameters(
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def cost(logarithms: Tensor) -> Tensor:
-        hyperparameters = logarithms.exp()
+        by_errors = length is not None
+        values = logarithms.exp()  # length, nugget and scale
         total = torch.zeros(())
         for held in held_out:
-            total = total + negative_log_likelihood(
-                scene, held, *hyperparameters, by_errors=length is not None
-            )
+            total = total + negative_log_likelihood(scene, held, *values, by_errors=by_errors)
         return total
 
     def cost_and_gradient(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
