@@ -47,7 +47,8 @@ def propose_by_phases(
     """
     plane = planes[number]
     axes = tangents(plane[:3])
-    offsets, tilts, other_tilts = grids = _grids(data, reach, tilt)
+    grids = _grids(data, reach, tilt)
+    offsets, tilts, other_tilts = grids
     parts = []
     references = data.reference_phases(planes, data.receivers)
     for receiver, phase in zip(data.receivers, references, strict=True):

@@ -70,8 +70,8 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         if is_first() and model.state_dict():
             checkpoint.save(model, best)
         return Fitted({name: model}, {}, start)
-    # Kriging falls back on a simple law of levels where the trained model is worse. A training
-    # that surely stays below the law's score, by two standard errors, would be in vain.
+    # Kriging falls back on a simple law of levels where the trained model is worse. A training ends
+    # early if its score stays two standard errors below the law's.
     rival = None
     validation = drawn(links.split.validation)
     if kriged is not None and model.settles and len(validation) > 1:

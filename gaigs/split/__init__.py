@@ -144,7 +144,7 @@ def hold_out(
             f"of them or more, got {len(order)} with {len(links)} links; choose smaller runs or "
             f"cubes, add measurements{without}"
         )
-    # Groups numbered from 0: those of the random order, then those of the links.
+    # Numbers of the groups from 0: of each group in the random order, then of each link's group.
     _, numbers = torch.cat((order, groups[links])).unique(return_inverse=True)
     ordered, of_links = numbers.tensor_split([len(order)])
     weights = votes.new_zeros(len(order)).index_add(0, of_links, votes[links])

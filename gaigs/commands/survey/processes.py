@@ -98,7 +98,7 @@ def reception_chances(
 
     Args:
         processes: Process of each receiver, with its readings.
-        points: Coordinates: x, y and z [m], and those of the carrier.
+        points: x, y and z [m], and the coordinates of the carrier as in ``gaigs.kriging.links.coordinates``.
     """
     places = torch.cat([process.places for process in processes])  # (k, d)
     if not len(places):
