@@ -98,7 +98,7 @@ def reception_chances(
 
     Args:
         processes: Process of each receiver, with its readings.
-        points: x, y and z [m], and the coordinates of the carrier as in ``gaigs.kriging.links.coordinates``.
+        points: x, y and z [m], and one of the carrier, see ``gaigs.kriging.links.coordinates``.
     """
     places = torch.cat([process.places for process in processes])  # (k, d)
     if not len(places):
