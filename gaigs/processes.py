@@ -68,6 +68,19 @@ def keep_memory() -> None:
 
 
 @contextlib.contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Limits torch's threads alone; other threads of Python may do so at the same time."""
+    import torch  # slow to import
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextlib.contextmanager
 def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     """Limits the threads of torch and PoCL; PoCL keeps the limit of its first use.
 
@@ -87,35 +100,18 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
         count = max(1, processors // (processors if jobs < 0 else jobs))
     if count < 1:
         raise ValueError(f"threads must be at least 1, or null for all, got {count}")
-    import torch  # slow to import
-
     # OpenMP, and OpenCL of PoCL up to version 3 and later.
     variables = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-    before = torch.get_num_threads()
     environment = {name: os.environ.get(name) for name in variables}
-    os.environ |= dict.fromkeys(variables, str(count))
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-        for name, value in environment.items():
-            os.environ.pop(name, None)
-            if value is not None:
-                os.environ[name] = value
-
-
-@contextlib.contextmanager
-def torch_threads(count: int) -> Iterator[None]:
-    """Limits torch's threads alone; other threads of Python may do so at the same time."""
-    import torch  # slow to import
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    with torch_threads(count):
+        os.environ |= dict.fromkeys(variables, str(count))
+        try:
+            yield
+        finally:
+            for name, value in environment.items():
+                os.environ.pop(name, None)
+                if value is not None:
+                    os.environ[name] = value
 
 
 def in_threads(function: Callable[[Part], Result], parts: Sequence[Part]) -> list[Result]:

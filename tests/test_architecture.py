@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 52_009,
+    "lines of gaigs/": 52_005,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
